@@ -20,7 +20,7 @@ from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySetting
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
-from aeroloop.protocol.wire.loop import WATCHDOG_S
+from aeroloop.protocol.wire.spec import WATCHDOG_S
 
 Sign: TypeAlias = Literal[-1, 1]
 

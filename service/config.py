@@ -17,9 +17,8 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
-from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError

@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.protocol.wire.attitude import angle
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.loop import WATCHDOG_S
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import WATCHDOG_S, WireSpec
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

@@ -18,9 +18,8 @@ from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.attitude import sent_vector
-from aeroloop.protocol.wire.loop import WATCHDOG_S
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.protocol.wire.spec import WATCHDOG_S, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 
 
 class Endpoint(VehicleClaim):
@@ -70,13 +69,13 @@ class Endpoint(VehicleClaim):
         """Apply the newest command, advance the plant to tick k, and measure.
 
         Args:
-            frame: The newest command frame received since the last tick, or None; in lockstep SILENCE if the command
+            frame: The newest command frame received since the last tick, or None; in lockstep UNCHANGED if the command
                 has not changed.
             k: Tick index, from 0, rising. If it skips, the plant advances by all skipped periods. The first call
                 ignores the frame: nothing was measured before it.
 
         Returns:
-            The measurement frame; SILENCE if it would repeat the last one and need not be sent; None without a session.
+            The measurement frame; UNCHANGED if it would repeat the last one; None without a session.
         """
         self.outcome = Outcome.NONE
         if self.ticked < 0:
@@ -103,7 +102,7 @@ class Endpoint(VehicleClaim):
             return None
         codes = self._encoded(seen)
         self._invalid[self.counter] = codes is self._no_measurement
-        return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else SILENCE
+        return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else UNCHANGED
 
     @property
     def _now_ns(self) -> int:

@@ -21,9 +21,8 @@ from typing import Any, Final, Literal, NamedTuple
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal, SessionRecord
 from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Outcome, PlantChange, PlantChangeKind
-from aeroloop.protocol.wire.loop import FIRST_COMMAND_S
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import FIRST_COMMAND_S, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _FIRST_COMMAND_NS: Final = round(FIRST_COMMAND_S * 1e9)
 
@@ -273,7 +272,7 @@ class VehicleClaim:
 
     def _command(self, frame: bytes, now_ns: int) -> Outcome:
         """Put a command's voltages in force if it is well-formed, fresh and valid."""
-        if frame == SILENCE and self._silent_commands and self._codes:
+        if frame == UNCHANGED and self._silent_commands and self._codes:
             read: tuple[int, tuple[float, ...]] | None = (self._freshness.echo + 1) % self._counters, self._codes
         else:
             read = self.wire.command.unpack(frame)

@@ -24,9 +24,8 @@ from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 WAIT_S: Final = 0.01
 SESSIONS: Final = 16
@@ -50,7 +49,7 @@ class Relay(VehicleClaim):
         if self.session is None:
             return None
         begun = self.session_tick >= 0
-        if frame == SILENCE and self._silent_measurements:
+        if frame == UNCHANGED and self._silent_measurements:
             ticks = int(begun)
         elif (read := self.wire.measurement.unpack(frame)) is None:
             self.refused += 1

@@ -19,7 +19,7 @@ from aeroloop.protocol.runtime.timing import Throttle
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 MASTER: Final = "the controller's side"
 
@@ -73,7 +73,7 @@ class CanNetwork(PlantNetwork):
         self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE only in lockstep."""
+        """Send a measurement frame; UNCHANGED only in lockstep."""
         if frame or self._loop.lockstep:
             self._bus.send(frame)
 

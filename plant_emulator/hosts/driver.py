@@ -20,9 +20,8 @@ from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.timing import Clock, LoopTiming, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
@@ -58,14 +57,14 @@ class PlantNetwork(ABC):
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; UNCHANGED only in lockstep, where the controller cannot detect it by time."""
 
     @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """After the measurement was sent: write the tick's trace row, then as `follow_session`.
 
         Args:
-            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if there is none.
+            measurement: The endpoint's frame; UNCHANGED if it is not to be sent, None if there is none.
             arrival: The command received since the last tick, before any injected fault; None for none.
             sent_ns: When the measurement was sent, on the monotonic clock [ns].
         """
@@ -205,7 +204,7 @@ class Driver:
                 # The controller takes a frame without a counter for the tick after its last.
                 echo = measured.counter(sent)
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
-                if sent == SILENCE:
+                if sent == UNCHANGED:
                     echo = self._counter
         network.after_tick(measurement, arrival, sent_ns)
         return echo

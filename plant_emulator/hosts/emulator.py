@@ -20,9 +20,8 @@ from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 
 class Emulator(Driver):
@@ -103,8 +102,8 @@ class Emulator(Driver):
         return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        if frame == SILENCE and not self._loop.lockstep:  # not a frame, so no fault acts on it
-            return self._faulty.passes("measurement", None) or [SILENCE]
+        if frame == UNCHANGED and not self._loop.lockstep:  # not a frame, so no fault acts on it
+            return self._faulty.passes("measurement", None) or [UNCHANGED]
         return self._faulty.passes("measurement", frame)
 
 

@@ -28,8 +28,7 @@ from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
 """Analog outputs that carry the motors' voltages, and digital outputs that enable their amplifiers."""

@@ -22,9 +22,8 @@ from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, Sent
 from aeroloop.protocol.plugins import PluginError
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _FIELDS: Final = ("session", "session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
 """Compared columns of a row; the first that differs is reported."""
@@ -141,7 +140,7 @@ class PlantReplay:
                 self._change(changes.popleft())
             if self._emulator.endpoint.session is None:
                 raise _StoppedError(f"tick {tick} is in a session whose claim is missing")
-            frames = {Sent.FRAME: command, Sent.SILENT: SILENCE, Sent.NONE: None}
+            frames = {Sent.FRAME: command, Sent.SILENT: UNCHANGED, Sent.NONE: None}
             self._compare(tick, frames.get(received_as, malformed), (batch.header.session, *values))
         for change in changes:
             self._change(change)

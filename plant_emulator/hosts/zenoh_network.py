@@ -23,7 +23,7 @@ from zenoh.handlers import RingChannel
 from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.hosts.driver import PlantNetwork
 from aeroloop.plant_emulator.hosts.latch_file import KEPT_S, Latch, LatchFile
-from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
     Claim,
     FaultStatus,
@@ -32,17 +32,15 @@ from aeroloop.protocol.messages.models import (
     Release,
     SessionRecord,
     Status,
-    Tenure,
 )
-from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
+from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 OTHERS_PERIOD_NS: Final = 10_000_000
@@ -126,10 +124,10 @@ class ZenohNetwork(PlantNetwork):
             self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE only in lockstep."""
+        """Send a measurement frame; UNCHANGED only in lockstep."""
         if self._link is not None and (frame or self._loop.lockstep):
             self._link.send(frame)
-            self._sent += frame != SILENCE
+            self._sent += frame != UNCHANGED
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Write the trace row, measure the latency, publish events and a due status."""
@@ -145,7 +143,7 @@ class ZenohNetwork(PlantNetwork):
             self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
         if measurement:
             self._sent_at[endpoint.counter] = endpoint.session_tick, sent_ns
-        self._received += arrival is not None and arrival.frame != SILENCE
+        self._received += arrival is not None and arrival.frame != UNCHANGED
         self.follow_session()
 
     def follow_session(self) -> None:
@@ -259,8 +257,8 @@ class ZenohNetwork(PlantNetwork):
         """Trip if another plant end publishes under this one's name, as after a network was cut and healed."""
         self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
         if (sample := self._others.try_recv()) is not None:
-            with suppress(intake.IntakeError):
-                other = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process
+            with suppress(MessageError):
+                other = Status.decode(sample.payload.to_bytes(), extra="ignore").process
                 if self._endpoint.trip is not TripCause.DUPLICATE:
                     which = f"this one ({self._role.process}) and another ({other})"
                     text = (
@@ -343,10 +341,10 @@ class PlantTrace:
         command, received_ns = arrival or (b"", 0)
         received_as = Sent.NONE
         if arrival is not None:
-            received_as = Sent.SILENT if command == SILENCE else Sent.FRAME
+            received_as = Sent.SILENT if command == UNCHANGED else Sent.FRAME
             if command and len(command) != self._command_bytes:
                 received_as, command = Sent.MALFORMED, b""
-        writer.plant_row(
+        row = PlantRow(
             end.ticked,
             end.session_tick,
             Sent.NONE if measurement is None else Sent.FRAME if measurement else Sent.SILENT,
@@ -360,6 +358,7 @@ class PlantTrace:
             command,
             end.voltages,
         )
+        writer.row(row)
         if writer.due(sent_ns):
             self._publish_batch(final=False)
 

@@ -20,8 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from aeroloop.plant_emulator.model.emulated import BodySettings, Mechanism, torque_of_motion
-from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import from_euler
+from aeroloop.protocol.wire.attitude import Vector, from_euler
 
 
 class AeroSettings(BodySettings):

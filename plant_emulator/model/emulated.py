@@ -17,8 +17,7 @@ from pydantic import AfterValidator, BaseModel, Field, model_validator
 from aeroloop.plant_emulator.model.sensors import Sensors
 from aeroloop.plant_emulator.model.wind import Wind
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
-from aeroloop.protocol.wire.attitude import Quaternion, Vector
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import Quaternion, R, S, Vector
 from aeroloop.protocol.wire.symbolic import Compiled
 
 # ── mechanism ──

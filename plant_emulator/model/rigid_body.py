@@ -7,8 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from aeroloop.plant_emulator.model.emulated import BodySettings, Direction, Mechanism, torque_of_motion
-from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import T
+from aeroloop.protocol.wire.attitude import T, Vector
 
 
 class RigidBodySettings(BodySettings):

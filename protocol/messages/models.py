@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, Field, PlainSerializer, StringConstraints
+from pydantic import AfterValidator, AwareDatetime, Field, PlainSerializer, StringConstraints
 
-from aeroloop.protocol.messages.operator import Angles, Change, Gains, Message, Reference, Stream
+from aeroloop.protocol.messages.operator import REFERENCE_VALUES, Angles, Change, Gains, Message, Reference, Stream
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.spec import WireSpec
 
 PROTOCOL_VERSION: Final = 2
+
+STATUS_VALUES: Final = 2048
+"""Values of a status with 128 faults, twice."""
 
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
@@ -55,6 +58,7 @@ class Claim(Message):
 class SessionRecord(Message):
     """Gains and reference of a session. The plant keeps the last one for the next controller, with how it ended."""
 
+    max_values = REFERENCE_VALUES
     controller: str
     session: str | None = Field(description="null: none runs, and the next one begins so")
     gains: Gains = Field(description="all of the law")
@@ -90,6 +94,7 @@ class SessionRecord(Message):
 class Grant(Message):
     """The plant's answer to a claim it accepts. The first measurement follows at once."""
 
+    max_values = REFERENCE_VALUES
     granted: Literal[True] = True
     session: str
     last: SessionRecord | None = Field(default=None, description="the last session's record; null if there is none")
@@ -113,6 +118,7 @@ class Release(Message):
 class Description(Message):
     """Identity and configuration of a role: all that a log reader needs to read the log."""
 
+    max_values = REFERENCE_VALUES
     protocol: int = Field(description="version of SPEC.md that the role implements")
     role: str
     vehicle: str
@@ -165,6 +171,7 @@ class FaultStatus(Message):
 class Status(Message):
     """State and counters of a role; the last one before it ends has the final counts."""
 
+    max_values = STATUS_VALUES
     role: str
     state: str
     session: str | None = None
@@ -216,16 +223,6 @@ class Status(Message):
     gains_from: Source | None = None
     reference: str | None = Field(default=None, description="controller: its reference, in words; likewise")
     reference_from: Source | None = None
-
-
-class Tenure(BaseModel, extra="ignore"):
-    """What another end reads of a plant's status, whatever else is in it: it takes a tenth of the time."""
-
-    state: str
-    process: str
-    session: str | None = None
-    cause: str | None = None
-    datagrams: str = ""
 
 
 class Telemetry(Message):

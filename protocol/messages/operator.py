@@ -1,4 +1,4 @@
-"""Operator requests, references, gains and changes, with their bounds.
+"""Base of all messages; operator requests, references, gains and changes, with their bounds.
 
 A reference gives roll, pitch and yaw over time. A new one is approached from the one before within `within_s`: angle,
 rate and acceleration never jump.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import isfinite, pi
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -18,44 +18,62 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     StringConstraints,
+    ValidationError,
     model_serializer,
     model_validator,
 )
 
-from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wording import problem
 
 MAX_POINTS: Final = 10_000
 MAX_WITHIN_S: Final = 600.0
 
+MAX_VALUES: Final = 256
+"""Values of an ordinary message: a claim has 17, a request that injects 64 faults 65."""
+REFERENCE_VALUES: Final = 4 * MAX_POINTS + MAX_VALUES
+"""Values of what may hold a reference of `MAX_POINTS` points, which takes some 10 ms to parse."""
+
+
+class MessageError(AeroloopError):
+    """The payload is no such message; one line that says why."""
+
 
 class Message(BaseModel):
-    """Base of all messages. Unknown fields are refused, so that a message of another version is not read in part.
+    """Base of all messages. Unknown fields are refused, so that a message of another version is not read in part."""
 
-    A model's parser is built at its first use: a command of `aeroloop op` uses few of them, and starts sooner. A loop
-    builds all of them before its first tick, with `build_messages`.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    max_values: ClassVar[int] = MAX_VALUES
 
     def encode(self) -> bytes:
         """The message as JSON."""
         return self.model_dump_json().encode()
 
+    @classmethod
+    def decode(cls, payload: bytes, *, extra: Literal["ignore", "forbid"] | None = None) -> Self:
+        """Read JSON that anyone on the network may have sent; `extra` replaces the model's rule for unknown fields.
 
-def build_messages(base: type[Message] = Message) -> None:
-    """Build the parsers of all messages derived from `base`, some milliseconds each."""
-    for model in base.__subclasses__():
-        model.model_rebuild()
-        build_messages(model)
+        A parser holds Python's lock, so a loop in the same process waits for it, and pydantic makes an object of every
+        error: 100 ms for 2 MB of unknown keys. So values are counted, by their commas, before anything is parsed.
+
+        Raises:
+            MessageError: It has more than `max_values` values, or is no such message.
+        """
+        if payload.count(b",") > cls.max_values:
+            raise MessageError(f"not a {cls.__name__}: more than {cls.max_values} values")
+        try:
+            return cls.model_validate_json(payload, extra=extra)
+        except ValidationError as error:
+            raise MessageError(f"not a {cls.__name__}: {problem(error, cls)}") from None
 
 
-def _finite(triple: Vector) -> Vector:
-    if not all(isfinite(value) for value in triple):
+def _finite(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(isfinite(value) for value in numbers):
         raise ValueError("every element must be a number")
-    return triple
+    return numbers
 
 
-Angles = Annotated[Vector, AfterValidator(_finite)]
+Angles = Annotated[tuple[float, float, float], AfterValidator(_finite)]
 """Roll, pitch, yaw [deg]."""
 
 Frequency = Annotated[float, Field(ge=0, le=100)]
@@ -124,7 +142,7 @@ def in_words(reference: Reference) -> str:
             return "a stream of set-points"
 
 
-def _degrees(angles: Vector) -> str:
+def _degrees(angles: Sequence[float]) -> str:
     return "roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)
 
 
@@ -142,17 +160,11 @@ def _numbers(gain: Any) -> Any:
     return (gain,) if isinstance(gain, int | float) else gain
 
 
-def _all_finite(gain: tuple[float, ...]) -> tuple[float, ...]:
-    if not all(isfinite(value) for value in gain):
-        raise ValueError("every element must be a number")
-    return gain
-
-
 Gain = Annotated[
     tuple[float, ...],
     Field(min_length=1, max_length=MAX_GAINS),
     BeforeValidator(_numbers, json_schema_input_type=float | tuple[float, ...]),
-    AfterValidator(_all_finite),
+    AfterValidator(_finite),
 ]
 """The numbers of a gain; a single one may stand without brackets."""
 
@@ -204,6 +216,7 @@ class Request(Message):
 class Track(Message):
     """Follow another reference from the next tick on."""
 
+    max_values = REFERENCE_VALUES
     reference: Reference | None = Field(description="null: the one that the controller is configured with")
     within_s: float = Field(
         default=2.0,

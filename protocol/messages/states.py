@@ -131,26 +131,14 @@ Trigger = TypeVar("Trigger", bound=StrEnum)
 
 
 class Machine(Generic[State, Trigger]):
-    """A state and its transition table.
-
-    Args:
-        start: The first state.
-        table: State and trigger to the next state.
-
-    Attributes:
-        state: Present state.
-    """
+    """A state and its transition table, from state and trigger to the next state."""
 
     def __init__(self, start: State, table: Mapping[tuple[State, Trigger], State]) -> None:
         self.state = start
         self._table = table
 
     def fire(self, trigger: Trigger) -> State:
-        """Apply a trigger and return the next state.
-
-        Raises:
-            ValueError: The table has no such transition.
-        """
+        """Apply a trigger and return the next state. Raises ValueError if the table has no such transition."""
         after = self._table.get((self.state, trigger))
         if after is None:
             raise ValueError(f"a state machine that is {self.state} cannot take {trigger!r}")

@@ -44,19 +44,15 @@ NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 
 
-FRAME_BYTES: Final = 256
-"""More than the longest frame: six elements of 64 bits and a counter."""
 QUERIES_PER_S: Final = 50.0
 """Most queries a second on a topic that a process takes from one link; what comes sooner after another is dropped. One
 rate for all topics: Zenoh applies any of the rules that a wildcard query meets."""
-MESSAGE_BYTES: Final = 16_384
-"""Enough for an event of many lines."""
-STATUS_BYTES: Final = 65_536
-"""Enough for a status with all notes and twice as many faults as may act at a time."""
-SAMPLE_BYTES: Final = 2048
-"""Enough for one tick's telemetry or truth."""
-POINTS_BYTES: Final = 2_097_152
-"""Enough for what may hold references of `MAX_POINTS` points: descriptions, requests to track, tails of traces."""
+
+FRAME_BYTES: Final = 256  # more than the longest frame: six elements of 64 bits and a counter
+SAMPLE_BYTES: Final = 2048  # one tick's telemetry or truth
+MESSAGE_BYTES: Final = 16_384  # an event of many lines
+STATUS_BYTES: Final = 65_536  # a status with all notes and twice as many faults as may act at a time
+POINTS_BYTES: Final = 2_097_152  # references of `MAX_POINTS` points: in descriptions, requests to track, traces' tails
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,7 @@ class Topic:
     Attributes:
         name: Name in this program.
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
-        carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
+        kind: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
             reply), `token` (liveliness, no payload).
         senders: Roles that publish it, hold it or query by it; under its own role where the key has one.
         receivers: Roles that subscribe to it, watch it or answer it.
@@ -79,7 +75,7 @@ class Topic:
 
     name: str
     key: str
-    carries: Literal["frame", "trace", "json", "query", "token"]
+    kind: Literal["frame", "trace", "json", "query", "token"]
     senders: _Roles
     receivers: _Roles
     model: type[Message] | None = None
@@ -90,16 +86,16 @@ class Topic:
     @property
     def recorded(self) -> bool:
         """Whether it is published from a cache and recorded: a subscriber that joins late recovers earlier messages."""
-        return self.carries in ("trace", "json")
+        return self.kind in ("trace", "json")
 
     @property
     def answered(self) -> bool:
         """Whether roles answer queries on it."""
-        return self.carries == "query" or self.name in ("description", "status")
+        return self.kind == "query" or self.name in ("description", "status")
 
     @property
     def title(self) -> str:
-        """Name of what it carries, for schemas."""
+        """Name of its schema."""
         return self.model.__name__ if self.model else self.name.capitalize()
 
 
@@ -135,7 +131,7 @@ TOPICS: Final = {
 RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
 """Topics published from a cache."""
 
-FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
+FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.kind == "frame")
 """Topics of frames."""
 
 _Actions = tuple[Action, ...]
@@ -147,7 +143,7 @@ ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
     "query": (("query",), ("answer",)),
     "token": (("hold",), ("watch",)),
 }
-"""What senders and what receivers do, by what a topic carries. A cache answers queries."""
+"""What senders and what receivers do, by a topic's kind. A cache answers queries."""
 
 _CACHE: Final = "/@cache"
 _CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}

@@ -22,17 +22,16 @@ from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status, Tenure
-from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
+from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, MessageError
 from aeroloop.protocol.messages.states import STOPPED
 from aeroloop.protocol.runtime.host import host_facts, name_process, versions
 from aeroloop.protocol.runtime.timing import Clock, Throttle
 from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
 from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 M = TypeVar("M", bound=Message)
 Action = Callable[[], object]
@@ -110,7 +109,7 @@ class Requests:
                 return
             try:
                 if len(self._inbox) >= WAITING:
-                    raise intake.IntakeError(f"{WAITING} requests wait already; ask again")
+                    raise MessageError(f"{WAITING} requests wait already; ask again")
                 action = prepare(self._read(topic, model, payload))
             except AeroloopError as error:
                 reply(query, Answer(done=False, text=str(error)))
@@ -120,13 +119,13 @@ class Requests:
         self._session.declare_queryable(key, received, complete=True)
 
     def _read(self, topic: str, model: type[M], payload: bytes) -> M:
-        """Read a request. Raises IntakeError."""
-        short = len(payload) <= topics.MESSAGE_BYTES and intake.few(payload)
+        """Read a request. Raises MessageError."""
+        short = len(payload) <= topics.MESSAGE_BYTES and payload.count(b",") <= MAX_VALUES
         if short or topics.TOPICS[topic].request <= topics.MESSAGE_BYTES:
-            return intake.read(model, payload)
+            return model.decode(payload)
         if self._long.let_pass(topic) is None:
-            raise intake.IntakeError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
-        return intake.read(model, payload, intake.REFERENCE)
+            raise MessageError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
+        return model.decode(payload)
 
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
@@ -265,7 +264,7 @@ class Node:
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
-        json = topics.TOPICS[topic].carries == "json"
+        json = topics.TOPICS[topic].kind == "json"
         self._publishers[topic] = CachedPublisher(
             self.zenoh,
             topics.key(topic, self.vehicle, role=self.role),
@@ -360,8 +359,8 @@ class RecorderWatch:
     def gone(self) -> bool:
         """Whether it disappeared and its last status does not say that it stopped."""
         if (sample := self._statuses.try_recv()) is not None:
-            with suppress(intake.IntakeError):
-                self._stopped = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).state == STOPPED
+            with suppress(MessageError):
+                self._stopped = Status.decode(sample.payload.to_bytes(), extra="ignore").state == STOPPED
         return self._was_there and not self.present and not self._stopped
 
     def _see(self, appeared: bool) -> None:

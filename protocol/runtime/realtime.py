@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import build_messages
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 _PR_SET_TIMERSLACK: Final = 29
 _MCL_ALL: Final = 1 | 2
@@ -34,7 +33,7 @@ class RealtimeError(AeroloopError):
 
 
 def prepare_process(settings: LoopSettings) -> list[str]:
-    """Prepare this process for a loop: build the parsers of messages, apply the real-time settings.
+    """Prepare this process for a loop: apply the real-time settings.
 
     The garbage collector is switched off (see `collect_garbage`), the timer slack set to its minimum, memory locked,
     the process bound to `cpus`, SCHED_FIFO requested, idle CPUs kept awake.
@@ -45,7 +44,6 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     Raises:
         RealtimeError: A setting other than awake CPUs was refused, and `realtime` is strict.
     """
-    build_messages()
     if settings.realtime == "off":
         return []
     gc.collect()

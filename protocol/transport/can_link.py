@@ -26,7 +26,7 @@ from aeroloop.protocol.transport.can_format import (
 )
 from aeroloop.protocol.transport.link import Link
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _BUS_OFF: Final = 0x40  # of a SocketCAN error frame's id
 _RECEIVE_S: Final = 0.1
@@ -72,7 +72,7 @@ class CanLink(Link):
         self._receive_id, self._peer_beat_id = taken
         self._settings = settings
         self._size = getattr(wire, received).size
-        self._may_be_silent = len(SILENCE) in wire.lengths(received, lockstep=lockstep)
+        self._may_be_silent = len(UNCHANGED) in wire.lengths(received, lockstep=lockstep)
         self._reopen_due = 0.0
         self._open = False
         self.peer: Heartbeat | None = None
@@ -177,7 +177,7 @@ class CanLink(Link):
     def _accept(self, identifier: int, data: bytes) -> None:
         now, size = time.monotonic_ns(), self._size
         if identifier == self._receive_id:
-            silent = data == SILENCE and self._may_be_silent
+            silent = data == UNCHANGED and self._may_be_silent
             padded = len(data) == size or (len(data) > size > CLASSIC_BYTES and not any(data[size:]))
             if silent or padded:
                 self.peer_ns = now

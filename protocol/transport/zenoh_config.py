@@ -178,7 +178,7 @@ def _rules(role: str, vehicle: str) -> list[dict[str, Any]]:
     """What a peer of a role may send (ingress) and is sent (egress): the other half of each topic."""
     rules = []
     for carries, (sending, receiving) in ACTIONS.items():
-        rows = [topic for topic in TOPICS.values() if topic.carries == carries]
+        rows = [topic for topic in TOPICS.values() if topic.kind == carries]
         sent = [topic for topic in rows if role in (ROUTER, *topic.senders)]
         received = [topic for topic in rows if role in (ROUTER, *topic.receivers)]
         of_role = "*" if role == ROUTER else role
@@ -208,6 +208,6 @@ def _keys(rows: list[Topic], vehicle: str, role: str = "*") -> list[str]:
         keys.append(key)
         if topic.recorded:
             keys.append(topics.cache_key(key))
-        elif topic.carries == "token" and role != "*":
+        elif topic.kind == "token" and role != "*":
             keys.append(f"{key}-$*")
     return keys

@@ -1,7 +1,7 @@
 """Quantizers as CasADi expressions, for loops that are compiled as a whole: the codes and levels of the Python classes.
 
-Each line does the float operations of its twin in `quantizer`, `hysteresis` or `logarithmic`, in the same order, so
-that every bit is equal. A logarithmic level or edge is computed where its twin looks it up in a table.
+Each line does the float operations of its twin in `quantizer.py`, in the same order, so that every bit is equal. A
+logarithmic level or edge is computed where its twin looks it up in a table.
 
 CasADi simplifies as it builds: c·(d·x) becomes (c·d)·x, which rounds differently. `as_written` switches that off.
 What it leaves alone: `if_else` adds a 0 to the part that it selects, so that −0.0 becomes 0.0.
@@ -18,9 +18,16 @@ from typing import Final
 
 import casadi as ca
 
-from aeroloop.protocol.wire.hysteresis import SLACK, HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import (
+    SLACK,
+    TIE,
+    CodedQuantizer,
+    Continuous,
+    HysteresisQuantizer,
+    LogarithmicQuantizer,
+    Quantizer,
+    UniformQuantizer,
+)
 
 NUMBERS: Final = ("deadzone", "step", "top", "limit", "hysteresis", "threshold", "growing")
 """Attributes of quantizers that the expressions use; a kind has some of them."""
@@ -58,7 +65,7 @@ def with_numbers(quantizer: Quantizer, symbols: ca.SX) -> Quantizer:
 
 
 def level(quantizer: Quantizer, code: ca.SX) -> ca.SX:
-    """The level of a code, as `Quantizer.decode`: NaN for `invalid`. Build it `as_written`. Shape (1,)."""
+    """The level of a code, as `Quantizer.level`: NaN for `invalid`. Build it `as_written`. Shape (1,)."""
     if isinstance(quantizer, Continuous):
         return code
     assert isinstance(quantizer, CodedQuantizer)

@@ -23,14 +23,9 @@ DEFAULT_COUNTER_BITS: Final = 8
 
 
 class FrameFormat:
-    """One kind of frame: a counter and `widths` codes; a width of None is a float64.
-
-    Args:
-        widths: Bits of each code.
-        counter_bits: Bits of the counter, 4…16.
+    """One kind of frame: a counter of 4…16 bits, and a code for each of `widths` [bit]; None is a float64.
 
     Attributes:
-        counter_bits: As given.
         counters: Number of counter values; the counter runs 0…counters − 1 and wraps.
         bits: Bits of counter and codes, without padding.
         first_bit: Offset of the first code [bit].

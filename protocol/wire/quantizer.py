@@ -2,36 +2,46 @@
 
 A value is quantized to a level (C.14); the level's index is the code, an R-bit two's-complement integer, and only the
 code is sent. R bits index 2^R − 1 levels, symmetric about zero; the spare code, −2^(R−1), means "no valid value" and
-decodes to NaN.
+its level is NaN.
 
     code   −2^(R−1)   −(2^(R−1) − 1)  …  −1   0   1  …  2^(R−1) − 1
     level  NaN        −y_max          …  −y₁  0   y₁ …  y_max
 
-With y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). The paper gives this l and says only y₀ > 0; l/2 is
-inferred: with it, 2^R − 1 intervals of that length fill the range exactly. For any other y₀ the step is such that the
-outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
-
-The uniform quantizer is the paper's; `hysteresis` and `logarithmic` define two more kinds (Remark 8).
+`UniformQuantizer` is the paper's, `Continuous` its "cont.". Remark 8 names two more kinds and cites another text for
+them; the definitions here are the project's own (SPEC.md, section 2).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from math import ceil, copysign, nan
+from bisect import bisect_left
+from collections.abc import Sequence
+from itertools import pairwise
+from math import ceil, copysign, expm1, inf, log, nan
 from typing import Final
 
 MIN_BITS: Final = 2
 MAX_BITS: Final = 16
 
+MIN_LOGARITHMIC_BITS: Final = 3
+"""With 2 bits there is one interval, which cannot be geometric and uniform."""
+
 TIE: Final[float] = 1 - 2.0**-50
 """A value within a few units in the last place of an interval's edge lies on the edge: dividing by l rounds."""
+
+SLACK: Final[float] = 1 - TIE
+
+_ALIKE: Final = 1 - 2.0**-30
+"""Tolerance of the last geometric interval against l: where the two are equal, rounding must not choose m."""
+
+_APART: Final = 2.0**-46
+"""Least distance of two edges, relative: more than what counts as a tie."""
 
 
 class Quantizer(ABC):
     """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) requires.
 
-    Decoding is stateless; encoding may depend on the last code, so each scalar has a quantizer of its own.
+    `level` has no memory; encoding may depend on the last code, so each scalar has a quantizer of its own.
 
     Attributes:
         limit: Edge of the range, in the signal's unit.
@@ -39,15 +49,17 @@ class Quantizer(ABC):
         saturated: Number of values beyond the range, which got the outermost level.
         outermost: The largest level, where saturation begins [signal's unit].
         invalid: The code of "no valid value".
-        level: `decode` without its check, for codes out of a frame, which are always valid.
     """
 
-    limit: float
     bound: float
-    saturated: int
     outermost: float
     invalid: float
-    level: Callable[[float], float]
+
+    def __init__(self, limit: float) -> None:
+        if not 0 < limit < inf:
+            raise ValueError(f"a signal's limit is positive and finite, not {limit}")
+        self.limit = limit
+        self.saturated = 0
 
     @abstractmethod
     def encode(self, y: float) -> float:
@@ -58,12 +70,8 @@ class Quantizer(ABC):
         """
 
     @abstractmethod
-    def decode(self, code: float) -> float:
-        """The level of a code; NaN for `invalid`.
-
-        Raises:
-            ValueError: Not a code of this quantizer.
-        """
+    def level(self, code: float) -> float:
+        """The level of a code; NaN for `invalid`. Raises ValueError for what is not a code of this quantizer."""
 
     def reset(self) -> None:  # noqa: B027  # most kinds have no memory
         """Clear the memory at a session's start; `saturated` goes on counting."""
@@ -73,7 +81,29 @@ class Quantizer(ABC):
 
     def quantize(self, y: float) -> float:
         """y^Q, the level that the quantizer gives y; (C.15) applies it to each element of a vector."""
-        return self.decode(self.encode(y))
+        return self.level(self.encode(y))
+
+
+class Continuous(Quantizer):
+    """The paper's "cont.": no quantization. The value is its own code; beyond the range, the limit; NaN is invalid."""
+
+    def __init__(self, limit: float) -> None:
+        super().__init__(limit)
+        self.outermost = limit
+        self.bound = 0.0
+        self.invalid = nan
+
+    def encode(self, y: float) -> float:
+        """The value itself, within ±limit; see `Quantizer.encode`."""
+        if -self.limit <= y <= self.limit:
+            return y
+        _refuse_nan(y)
+        self.saturated += 1
+        return copysign(self.limit, y)
+
+    def level(self, code: float) -> float:
+        """The value itself."""
+        return float(code)
 
 
 class CodedQuantizer(Quantizer):
@@ -97,24 +127,20 @@ class CodedQuantizer(Quantizer):
     invalid: int
 
     def __init__(self, bits: int, limit: float) -> None:
+        super().__init__(limit)
         if not MIN_BITS <= bits <= MAX_BITS:
             raise ValueError(f"a quantizer has {MIN_BITS} to {MAX_BITS} bits, not {bits}")
-        if not 0 < limit < float("inf"):
-            raise ValueError(f"a quantizer's limit is positive and finite, not {limit}")
         self.bits = bits
-        self.limit = limit
         self.top: int = 2 ** (bits - 1) - 1
         self.invalid = -self.top - 1
-        self.saturated = 0
 
     def _tabulate(self, positive: Sequence[float]) -> None:
         """Set the levels 1…N."""
         self.levels = [0.0, *positive, nan, *(-y for y in reversed(positive))]
         self.outermost = self.levels[self.top]
-        self.level = self.levels.__getitem__  # type: ignore[assignment]  # a code out of a frame is an int
 
-    def decode(self, code: float) -> float:
-        """The level of a code; NaN for `invalid`."""
+    def level(self, code: float) -> float:
+        """The level of a code; see `Quantizer.level`."""
         if not (isinstance(code, int) and self.invalid <= code <= self.top):
             raise ValueError(f"{code!r} is not a code of {self.bits} bits")
         return self.levels[code]
@@ -123,10 +149,14 @@ class CodedQuantizer(Quantizer):
 class UniformQuantizer(CodedQuantizer):
     """The uniform quantizer of (C.14). A tie goes towards zero: intervals are (y_i − l/2, y_i + l/2].
 
+    With y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). The paper gives this l and says only y₀ > 0; l/2 is
+    inferred: with it, 2^R − 1 intervals of that length fill the range exactly. For any other y₀ the step is such that
+    the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
+
     Args:
         bits: R, 2…16.
         limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀ [signal's unit]; l/2 if None, as inferred from the paper's l.
+        deadzone: y₀ [signal's unit]; l/2 if None.
 
     Attributes:
         step: l, the length of an interval [signal's unit].
@@ -145,7 +175,7 @@ class UniformQuantizer(CodedQuantizer):
             self.deadzone = deadzone
         else:
             raise ValueError(f"a dead zone lies between 0 and the limit {limit}, not at {deadzone}")
-        if not 0 < self.step < float("inf"):
+        if not 0 < self.step < inf:
             raise ValueError(f"a limit of {limit} leaves no step that a float can hold")
         self.bound = max(self.deadzone, self.step / 2)
         self._tabulate([self.deadzone + self.step / 2 + i * self.step for i in range(self.top)])
@@ -158,36 +188,143 @@ class UniformQuantizer(CodedQuantizer):
         if x > self.top:
             self.saturated += 1
             return self.top if y > 0 else -self.top
-        if y != y:
-            raise ValueError("NaN has no code; send the code for 'no valid value'")
+        _refuse_nan(y)
         return ceil(x) if y > 0 else -ceil(x)
 
 
-class Continuous(Quantizer):
-    """The paper's "cont.": no quantization. The value is its own code; beyond the range, the limit; NaN is invalid.
+class HysteresisQuantizer(UniformQuantizer):
+    """The uniform quantizer's levels, and a code that is held while the value stays near its level.
+
+    The held level's interval is widened by h on either side; a value outside it is quantized uniformly. Noise of less
+    than h about an edge therefore changes no code and no frame, and the error bound grows by h. A tie goes to the held
+    level. The last code is the only state.
+
+        held level   0                  ±y_i
+        stays while  |y| ≤ y₀ + h       y_i − l/2 − h ≤ ±y ≤ y_i + l/2 + h
+
+    Args:
+        bits: R, 2…16.
+        limit: Edge of the range [signal's unit], > 0.
+        deadzone: y₀ [signal's unit]; l/2 if None.
+        hysteresis: h [signal's unit]; l/2 if None: a code changes once the value is more than a step from its level.
 
     Raises:
-        ValueError: The limit is not positive and finite.
+        ValueError: A value out of bounds.
     """
 
-    def __init__(self, limit: float) -> None:
-        if not 0 < limit < float("inf"):
-            raise ValueError(f"a signal's limit is positive and finite, not {limit}")
-        self.limit = self.outermost = limit
-        self.bound = 0.0
-        self.saturated = 0
-        self.invalid = nan
-        self.level = float
+    def __init__(self, bits: int, limit: float, deadzone: float | None = None, hysteresis: float | None = None) -> None:
+        super().__init__(bits, limit, deadzone)
+        self.hysteresis = self.step / 2 if hysteresis is None else hysteresis
+        if not 0 < self.hysteresis < limit:
+            raise ValueError(f"hysteresis is more than 0 and less than the limit {limit}, not {hysteresis}")
+        self.bound += self.hysteresis
+        self.reset()
 
-    def encode(self, y: float) -> float:
-        """The value itself, within ±limit; see `Quantizer.encode`."""
-        if -self.limit <= y <= self.limit:
-            return y
-        if y != y:
-            raise ValueError("NaN has no code; send the code for 'no valid value'")
-        self.saturated += 1
-        return copysign(self.limit, y)
+    def encode(self, y: float) -> int:
+        """The code of a value, given the held code; see `Quantizer.encode`."""
+        if self._low <= y <= self._high:
+            return self._held
+        code = super().encode(y)
+        self._hold(code)
+        return code
 
-    def decode(self, code: float) -> float:
-        """The value itself; NaN for `invalid`."""
-        return float(code)
+    def reset(self) -> None:
+        """Hold nothing: the next value is quantized uniformly."""
+        self._held = 0
+        self._low, self._high = inf, -inf
+
+    def resume(self, code: float) -> None:
+        """Hold the level of a code; see `Quantizer.resume`."""
+        if code != self.invalid:
+            self._hold(int(code))
+
+    def _hold(self, code: int) -> None:
+        # A value within a few units in the last place of an edge lies on it. Beyond the limit a value saturates.
+        h, i = self.hysteresis, abs(code)
+        outer = self.deadzone + i * self.step
+        high = min(self.limit, outer + h + SLACK * (outer + h))
+        if code:
+            inner = outer - self.step
+            low = inner - h - SLACK * (inner + h)
+        else:
+            low = -high
+        self._held = code
+        self._low, self._high = (-high, -low) if code < 0 else (low, high)
+
+
+class LogarithmicQuantizer(CodedQuantizer):
+    """Logarithmic-uniform: intervals grow with the value up to a threshold, and have equal lengths beyond it.
+
+    The error is proportional to small values, as in a logarithmic quantizer, and bounded throughout, as in a uniform
+    one. Of the N = 2^(R−1) − 1 intervals on either side the first m are geometric, the others l long:
+
+        edge   e₀ = y₀   e_i = y₀·(y_t/y₀)^(i/m)   e_m = y_t   e_i = y_t + (i − m)·l   e_N = limit
+        code      0     |         1 … m                |         m + 1 … N
+
+    m is the least number for which no geometric interval is longer than l. A level is the middle of its interval. A
+    tie goes towards zero.
+
+    Args:
+        bits: R, 3…16.
+        limit: Edge of the range [signal's unit], > 0.
+        deadzone: y₀ [signal's unit]; if None a quarter of the uniform quantizer's, limit / (2^R − 1) / 4.
+        threshold: y_t, where the intervals stop growing [signal's unit], at most limit/2; limit/4 if None.
+
+    Attributes:
+        growing: m, the number of geometric intervals on either side.
+        step: l, the length of the uniform intervals [signal's unit].
+        edges: e₀ … e_N [signal's unit].
+
+    Raises:
+        ValueError: A value out of bounds.
+    """
+
+    def __init__(self, bits: int, limit: float, deadzone: float | None = None, threshold: float | None = None) -> None:
+        super().__init__(bits, limit)
+        if bits < MIN_LOGARITHMIC_BITS:
+            raise ValueError(f"a logarithmic-uniform quantizer has at least {MIN_LOGARITHMIC_BITS} bits, not {bits}")
+        self.deadzone = limit / (2**bits - 1) / 4 if deadzone is None else deadzone
+        self.threshold = limit / 4 if threshold is None else threshold
+        if not 0 < self.threshold <= limit / 2:
+            raise ValueError(f"a threshold is more than 0 and at most half the limit {limit}, not {self.threshold}")
+        if not 0 < self.deadzone < self.threshold:
+            raise ValueError(f"a dead zone lies between 0 and the threshold {self.threshold}, not at {self.deadzone}")
+        self.growing = self._least_growing()
+        self.step = self._step(self.growing)
+        ratio = self.threshold / self.deadzone
+        growing = [self.deadzone * ratio ** (i / self.growing) for i in range(self.growing)]
+        alike = [self.threshold + i * self.step for i in range(self.top - self.growing)]
+        self.edges = [*growing, *alike, limit]
+        if not all(b - a > _APART * b for a, b in pairwise(self.edges)):
+            raise ValueError(f"a limit of {limit} leaves no intervals that a float can distinguish")
+        self.bound = max(self.deadzone, max(b - a for a, b in pairwise(self.edges)) / 2)
+        self._tabulate([(a + b) / 2 for a, b in pairwise(self.edges)])
+
+    def encode(self, y: float) -> int:
+        """The code of a value; see `Quantizer.encode`."""
+        _refuse_nan(y)
+        i = bisect_left(self.edges, abs(y) * TIE)
+        if i > self.top:
+            self.saturated += 1
+            i = self.top
+        return i if y > 0 else -i
+
+    def _least_growing(self) -> int:
+        """m, by bisection: with a larger m the geometric intervals get shorter and the uniform ones longer."""
+        low, high = 1, self.top - 1
+        while low < high:
+            m = (low + high) // 2
+            longest = -self.threshold * expm1(-log(self.threshold / self.deadzone) / m)
+            if longest * _ALIKE <= self._step(m):
+                high = m
+            else:
+                low = m + 1
+        return low
+
+    def _step(self, m: int) -> float:
+        return (self.limit - self.threshold) / (self.top - m)
+
+
+def _refuse_nan(y: float) -> None:
+    if y != y:
+        raise ValueError("NaN has no code; send the code for 'no valid value'")

@@ -1,4 +1,4 @@
-"""Wire spec: quantizers, frame sizes and transmit policy, on which both ends must agree.
+"""Wire spec and loop settings: what both ends must agree on, and how each end keeps its tick grid.
 
 A signal has a kind of quantizer, bits and a range; a wire has three signals, a number of motors, a counter and a
 transmit policy. Claims, fingerprints, frames, the DBC and log readers derive every scale and width from it.
@@ -12,12 +12,24 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS, MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import (
+    MAX_BITS,
+    MIN_BITS,
+    Continuous,
+    HysteresisQuantizer,
+    LogarithmicQuantizer,
+    Quantizer,
+    UniformQuantizer,
+)
 from aeroloop.protocol.wire.transmit import Transmit
 
 MAX_ACTUATORS: Final = 8
+
+WATCHDOG_S: Final = 0.1
+"""0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
+
+FIRST_COMMAND_S: Final = 1.0
+"""How long a granted claim may wait for its first command [s]."""
 
 
 def bits_or_continuous(value: object) -> object:
@@ -30,6 +42,7 @@ Bits: TypeAlias = Annotated[
     _Number | None, BeforeValidator(bits_or_continuous, json_schema_input_type=_Number | Literal["cont"] | None)
 ]
 
+Positive: TypeAlias = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
 
@@ -41,24 +54,18 @@ class SignalSpec(BaseModel, frozen=True, extra="forbid"):
     """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
 
     bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
-    limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
-    deadzone: float | None = Field(
+    limit: Positive = Field(description="edge of the range [signal's unit]")
+    deadzone: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
     )
     kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
-    hysteresis: float | None = Field(
+    hysteresis: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="h: widens a held level's interval [signal's unit]; half a step if left out; hysteresis-uniform",
     )
-    threshold: float | None = Field(
+    threshold: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
     )
 
@@ -182,3 +189,37 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in tree.items():
         leaves |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return leaves
+
+
+class LoopSettings(BaseModel, extra="forbid"):
+    """Tick grid and process set-up of an end."""
+
+    rate_hz: float = Field(default=500.0, ge=1, le=10_000, description="ticks a second [Hz]")
+    lockstep: bool = Field(
+        default=False, description="the plant waits for each command before it steps: repeatable, as fast as possible"
+    )
+
+    realtime: Literal["strict", "try", "off"] = Field(
+        default="try",
+        description="request SCHED_FIFO, locked memory, affinity, and CPUs that stay awake; strict: refuse to run "
+        "without the first three; off: request none",
+    )
+    priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
+    cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
+    trace_s: float = Field(
+        default=0.1, ge=0.01, le=10, description="time between batches of the trace, which the log records [s]"
+    )
+
+    @property
+    def period_ns(self) -> int:
+        """Period of the grid [ns]."""
+        return round(1e9 / self.rate_hz)
+
+    @property
+    def period(self) -> float:
+        """Period of the grid [s]: the law's time step."""
+        return self.period_ns * 1e-9
+
+    def ticks(self, seconds: float) -> int:
+        """How many ticks make up this time, rounded."""
+        return round(seconds * 1e9 / self.period_ns)

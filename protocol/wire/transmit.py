@@ -2,7 +2,7 @@
 
 Quantized values change in steps, so a frame equal to the last one need not be sent: the receiver holds the last levels,
 and nothing is lost. A heartbeat, after less than half the counter's range, is the sender's sign of life and keeps its
-counter unambiguous. In lockstep each frame is waited for, so silence cannot be received: an empty frame, `SILENCE`,
+counter unambiguous. In lockstep each frame is waited for, so silence cannot be received: an empty frame, `UNCHANGED`,
 stands for it.
 """
 
@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-SILENCE: Final = b""
+UNCHANGED: Final = b""
 """Empty frame: stands for a frame that is not sent because it equals the last one."""
 
 Policy = Literal["periodic", "on_change"]

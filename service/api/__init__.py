@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from aeroloop.plant_emulator.plant import Plant as Plant
     from aeroloop.plant_emulator.plant import State as State
     from aeroloop.protocol.errors import AeroloopError as AeroloopError
-    from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer as HysteresisQuantizer
-    from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer as LogarithmicQuantizer
+    from aeroloop.protocol.wire.quantizer import HysteresisQuantizer as HysteresisQuantizer
+    from aeroloop.protocol.wire.quantizer import LogarithmicQuantizer as LogarithmicQuantizer
     from aeroloop.protocol.wire.quantizer import UniformQuantizer as UniformQuantizer
     from aeroloop.protocol.wire.spec import SignalSpec as SignalSpec
     from aeroloop.protocol.wire.spec import WireSpec as WireSpec
@@ -58,9 +58,9 @@ _HOMES: Final = {
     "Gain": "aeroloop.service.control.laws.interface",
     "Gains3": "aeroloop.service.control.laws.interface",
     "Hil": "aeroloop.service.testing.hil",
-    "HysteresisQuantizer": "aeroloop.protocol.wire.hysteresis",
+    "HysteresisQuantizer": "aeroloop.protocol.wire.quantizer",
     "LawSettings": "aeroloop.service.control.laws.interface",
-    "LogarithmicQuantizer": "aeroloop.protocol.wire.logarithmic",
+    "LogarithmicQuantizer": "aeroloop.protocol.wire.quantizer",
     "Measurement": "aeroloop.plant_emulator.plant",
     "Now": "aeroloop.service.control.laws.interface",
     "Plant": "aeroloop.plant_emulator.plant",

@@ -2,7 +2,7 @@
 
 It uses no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
 run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
-sent; the controller then receives SILENCE and computes with the levels it holds.
+sent; the controller then receives UNCHANGED and computes with the levels it holds.
 
 Between the two frames stands one evaluation of a `Tick`, on memory that stays. Its outputs are one row of doubles;
 after a valid tick the row is copied, and the copy is what the next tick and the properties here read.
@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, integers, parts
-from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 from aeroloop.service.control.laws.evaluation import configured_gains
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_of
@@ -112,13 +112,13 @@ class Controller:
         """Answer a measurement.
 
         Args:
-            frame: The newest measurement frame; SILENCE if the plant sent none because its levels have not changed;
+            frame: The newest measurement frame; UNCHANGED if the plant sent none because its levels have not changed;
                 None if none was received since the last tick.
             k: Tick index; the law's time is k·period.
 
         Returns:
-            The command frame; SILENCE if it would repeat the last one and need not be sent; None if there is nothing to
-            answer, which includes malformed bytes. A measurement without a valid value is answered by a command without
+            The command frame; UNCHANGED if it would repeat the last one; None if there is nothing to answer, which
+            includes malformed bytes. A measurement without a valid value is answered by a command without
             one: the plant then goes to 0 V.
         """
         if frame is None:
@@ -126,7 +126,7 @@ class Controller:
         read = self._read(frame)
         if read is not None:
             counter, self._held = read
-        elif frame == SILENCE and self._silence_allowed and self._held is not None:
+        elif frame == UNCHANGED and self._silence_allowed and self._held is not None:
             counter = k % self._counters
         else:
             self.refused += 1
@@ -142,7 +142,7 @@ class Controller:
         else:
             self._take_no_value(counter, k)
             command = self._no_command
-        return self._write(counter, command) if self._periodic or self._sender.due(k, command) else SILENCE
+        return self._write(counter, command) if self._periodic or self._sender.due(k, command) else UNCHANGED
 
     def _take_no_value(self, counter: int, k: int) -> None:
         """Count a measurement without a valid value, or keep what the law gives besides a voltage that is no number."""
@@ -173,7 +173,7 @@ class Controller:
     def attitude_of(self, frame: bytes) -> Quaternion | None:
         """The attitude in a measurement; None if it is malformed or has no valid value."""
         read = self._read(frame)
-        codes = read[1] if read is not None else self._held if frame == SILENCE and self._silence_allowed else None
+        codes = read[1] if read is not None else self._held if frame == UNCHANGED and self._silence_allowed else None
         if codes is None:
             return None
         x, y, z = map(self._attitude_level, codes[:3])

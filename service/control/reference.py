@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
-from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import conjugate, from_euler, product
-from aeroloop.protocol.wire.symbolic import Compiled, in_columns
+from aeroloop.protocol.wire.attitude import Vector, conjugate, from_euler, product
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.control.columns import in_columns
 
 Floats = NDArray[np.float64]
 

@@ -10,13 +10,12 @@ from typing import Final
 import zenoh
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Tenure
-from aeroloop.protocol.messages.operator import Answer
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Status
+from aeroloop.protocol.messages.operator import Answer, MessageError
 from aeroloop.protocol.runtime.node import Node, log_event
 from aeroloop.protocol.transport.link import ZenohLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0
@@ -87,8 +86,8 @@ class ClaimClient:
             return
 
         def answered(reply: zenoh.Reply) -> None:
-            with suppress(intake.IntakeError):
-                if reply.ok and intake.read(Answer, reply.ok.payload.to_bytes()).done:
+            with suppress(MessageError):
+                if reply.ok and Answer.decode(reply.ok.payload.to_bytes()).done:
                     self._kept = record
 
         self._role.zenoh.get(
@@ -123,9 +122,9 @@ class ClaimClient:
         if datagrams.linked:
             return datagrams.session
         for reply in role.zenoh.get(topics.key("status", role.vehicle, role="plant"), timeout=ANSWER_WAIT_S):
-            with suppress(intake.IntakeError):
+            with suppress(MessageError):
                 if reply.ok is None or not (
-                    endpoint := intake.read(Tenure, reply.ok.payload.to_bytes(), intake.STATUS).datagrams
+                    endpoint := Status.decode(reply.ok.payload.to_bytes(), extra="ignore").datagrams
                 ):
                     return role.zenoh
                 linked = datagrams.connect(endpoint)
@@ -145,8 +144,8 @@ class ClaimClient:
                 continue
             payload = reply.ok.payload.to_bytes()
             for model in _ANSWERS:
-                with suppress(intake.IntakeError):
-                    read = intake.read(model, payload, intake.REFERENCE)
+                with suppress(MessageError):
+                    read = model.decode(payload)
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 

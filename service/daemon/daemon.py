@@ -14,16 +14,16 @@ from typing import Final, Literal
 
 from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import SessionRecord, Status, Tenure
-from aeroloop.protocol.messages.operator import Answer, Request, in_words
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import SessionRecord, Status
+from aeroloop.protocol.messages.operator import Answer, MessageError, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
-from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
+from aeroloop.protocol.messages.trace import ControllerRow, Received, Sent, TraceWriter, batches_per_s
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import ZenohLink
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
@@ -86,7 +86,7 @@ class Daemon:
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
-        self._plant: Tenure | None = None
+        self._plant: Status | None = None
         self._plant_due = 0.0
         self._plants = 0  # how often a plant's token has appeared or disappeared
         self._granted = False  # whether the plant's status has ever named this session
@@ -213,7 +213,8 @@ class Daemon:
         if command is None:
             sent_ns = 0
         tick = max(now.tick, 0)
-        self._trace.controller_row(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        row = ControllerRow(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        self._trace.row(row)
         self._publish_trace_when_due()
 
     def _publish_trace_when_due(self) -> None:
@@ -230,13 +231,13 @@ class Daemon:
         assert session is not None
         self._ticks += 1
         self._read_plant()
-        if now.frame != SILENCE:
+        if now.frame != UNCHANGED:
             self._received += 1
         self._skipped += now.missed
         if now.missed >= STALL_TICKS:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", session, tick)
         if command is not None:
-            self._sent += command != SILENCE
+            self._sent += command != UNCHANGED
         if command is not None or self._too_slow is not None:
             self._advance_state(tick)
         if self._controller.tick_index == tick and tick % self._telemetry_every == 0:
@@ -328,7 +329,7 @@ class Daemon:
                 pass
             self._plant = None
 
-    def _read_plant(self) -> Tenure | None:
+    def _read_plant(self) -> Status | None:
         """The plant's newest status; None before the first, and once the plant is gone. Reads what came, at times."""
         now, plants = self._clock.monotonic(), self._plants
         if now < self._plant_due:
@@ -338,8 +339,8 @@ class Daemon:
             if (sample := self._plant_statuses.try_recv()) is None:
                 break
             try:
-                plant = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS)
-            except intake.IntakeError:
+                plant = Status.decode(sample.payload.to_bytes(), extra="ignore")
+            except MessageError:
                 self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
                 continue
             if plants == self._plants:

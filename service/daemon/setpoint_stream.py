@@ -7,8 +7,8 @@ from typing import Final
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.operator import Hold, Setpoint, Stream
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Hold, MessageError, Setpoint, Stream
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.control.reference import FollowError, Limits, Plan
 
@@ -48,10 +48,10 @@ class SetpointStream:
             if (sample := self._received.try_recv()) is None:
                 break
             try:
-                hold = Hold(attitude=intake.read(Setpoint, sample.payload.to_bytes()).attitude)
+                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
                 plan = Plan.of(hold)
                 plan.check(limits)
-            except (intake.IntakeError, FollowError) as error:
+            except (MessageError, FollowError) as error:
                 self.refuse(error)
             else:
                 newest = hold, plan

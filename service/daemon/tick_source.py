@@ -16,9 +16,8 @@ from aeroloop.protocol.messages.trace import Received
 from aeroloop.protocol.runtime.timing import Clock, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.frames import TickCounter
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 MAILBOX: Final = 16
 """Frames that may wait where silence is allowed: a displaced frame could not be classified as late."""
@@ -35,7 +34,7 @@ class PlantTick(NamedTuple):
 
     Attributes:
         tick: The session tick.
-        frame: The measurement; SILENCE if its levels have not changed.
+        frame: The measurement; UNCHANGED if its levels have not changed.
         received_as: Classification. A late frame is no tick; only its levels are used.
         due_ns: From when it could be answered, on `time.monotonic_ns()`.
         at_ns: When the frame arrived, or the tick was found silent, on the same clock.
@@ -113,7 +112,7 @@ class TickSource:
         tick = self.tick + 1
         if self._lockstep:
             self._ticks.tick = tick
-        empty = arrival.frame == SILENCE and self._lockstep
+        empty = arrival.frame == UNCHANGED and self._lockstep
         return self._as_tick(tick, arrival, Received.SILENT if empty else Received.MALFORMED, 0, fresh=empty)
 
     def _receive(self, timeout_s: float) -> Arrival | None:
@@ -150,7 +149,7 @@ class TickSource:
             return None
         missed, self.tick = tick - self.tick - 1, tick
         due_ns = self._over_ns(tick)
-        return PlantTick(tick, SILENCE, Received.SILENT, due_ns, due_ns, missed=missed)
+        return PlantTick(tick, UNCHANGED, Received.SILENT, due_ns, due_ns, missed=missed)
 
     def _as_tick(self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool) -> PlantTick:
         missed, self.tick = max(0, tick - self.tick - 1), tick

@@ -22,7 +22,7 @@ from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
 from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
 from aeroloop.protocol.transport.probe import PLAIN_S, refusal
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 CHECK_S: Final = 5.0
 GOOD_CLOCKS: Final = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page")

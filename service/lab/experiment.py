@@ -17,7 +17,7 @@ import numpy as np
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Claim, Refusal
-from aeroloop.protocol.wire.transmit import SILENCE, Policy
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
@@ -28,7 +28,7 @@ from aeroloop.service.lab.loop_function import Run, loop_of
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
 
 Watch: TypeAlias = Callable[[int, bytes, bytes], None]
-"""Called at every tick with k, the measurement and the command that answers it; SILENCE where none is sent."""
+"""Called at every tick with k, the measurement and the command that answers it; UNCHANGED where none is sent."""
 
 
 class LoopEndedError(ValueError):
@@ -145,10 +145,10 @@ def _through_frames(
                 trips = [controller.fault]
             raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
-            score.error(k, controller.attitude_error, sent=measurement != SILENCE)
+            score.error(k, controller.attitude_error, sent=measurement != UNCHANGED)
         if read := wire.command.unpack(command):
             voltages = [level(code) for code in read[1]]
-        score.command(k, voltages, sent=command != SILENCE)
+        score.command(k, voltages, sent=command != UNCHANGED)
         if watch is not None and measurement is not None:
             watch(k, measurement, command)
         measurement = endpoint.tick(command, k + 1)

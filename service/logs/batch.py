@@ -2,7 +2,7 @@
 
 All measurements are in the log, so only the attitude's sign and the law's state carry over from tick to tick. Law and
 reference are the loop's own CasADi instructions, run over columns with a row per tick (`law_of_many`,
-protocol/wire/symbolic.py), so the bits are the loop's (tests/service/logs/test_batch.py). A law in Python runs tick by
+service/control/columns.py), so the bits are the loop's (tests/service/logs/test_batch.py). A law in Python runs tick by
 tick.
 """
 
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
+from aeroloop.protocol.wire.symbolic import Buffer, Compiled
 from aeroloop.protocol.wire.transmit import Sender
+from aeroloop.service.control.columns import in_columns
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.evaluation import configured_gains, law_of_many
 from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings
@@ -71,7 +72,7 @@ class BatchController:
     """Computes many measurements per call.
 
     The reference holds from tick 0 on, the period is between ticks [s], `rows` is ticks per CasADi call, a multiple of
-    `aeroloop.protocol.wire.symbolic.UNROLLED`. Raises LawError and PluginError as Controller does.
+    `aeroloop.service.control.columns.UNROLLED`. Raises LawError and PluginError as Controller does.
     """
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float, rows: int = ROWS) -> None:

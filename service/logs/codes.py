@@ -14,9 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import (
+    TIE,
+    CodedQuantizer,
+    HysteresisQuantizer,
+    LogarithmicQuantizer,
+    Quantizer,
+    UniformQuantizer,
+)
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.logs.traces import Array
 

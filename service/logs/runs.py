@@ -255,7 +255,7 @@ class Run:
 
 
 def _is_sorted(address: Address) -> bool:
-    return address.topic.carries == "json" and address.topic.name not in ("event", "loss")
+    return address.topic.kind == "json" and address.topic.name not in ("event", "loss")
 
 
 class _Segment:

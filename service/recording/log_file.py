@@ -160,7 +160,7 @@ class LogFile:
 
 
 def _raw_shape(topic: topics.Topic) -> Shape | None:
-    if topic.carries == "trace":
+    if topic.kind == "trace":
         text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description"
         return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
     return json_shape(f"aeroloop.{topic.title}", topic.model) if topic.model is not None else None

@@ -17,8 +17,9 @@ from collections import Counter
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Loss, LossReason, Status
+from aeroloop.protocol.messages.operator import MessageError
 from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.node import Node
@@ -177,8 +178,8 @@ class Recorder:
         if published_ns < self._described.get(received.key, 0):
             return  # recovered after a newer one
         try:
-            description = intake.read(Description, received.payload, intake.REFERENCE)
-        except intake.IntakeError:
+            description = Description.decode(received.payload)
+        except MessageError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
         self._described[received.key] = published_ns

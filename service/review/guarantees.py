@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array

@@ -7,9 +7,7 @@ from functools import partial
 from rich.console import Console
 from rich.table import Column, Table
 
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import WireSpec
 
 

@@ -8,8 +8,7 @@ from typing import Any, Protocol, Self, cast
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Reference
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.settings import ControllerSettings

@@ -20,9 +20,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Event, Loss, Status, Telemetry, Truth
 from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
 from aeroloop.protocol.wire import attitude
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.viewers import views
 from aeroloop.service.viewers.body import WORLD, desired_frame_of, frame_of, scene, timestamp
 from aeroloop.service.viewers.schemas import Decoded, json_shape, protobuf_shape
@@ -142,7 +141,7 @@ class Decoder:
     def frame(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         """Decode a frame from the network, without a limit of rate; silence in lockstep gives nothing."""
         wire, name = self._wires.get(address.vehicle), address.topic.name
-        if wire is None or (payload == SILENCE and name in wire.silent):
+        if wire is None or (payload == UNCHANGED and name in wire.silent):
             return []
         return self._framed(address.vehicle, name, wire, payload, at_ns)
 

@@ -32,8 +32,7 @@ from aeroloop.protocol.transport.can_format import (
     carried_bytes,
 )
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import UniformQuantizer
+from aeroloop.protocol.wire.quantizer import LogarithmicQuantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 _MAX_CYCLE_MS: Final = 2**16 - 1  # what cantools declares for GenMsgCycleTime

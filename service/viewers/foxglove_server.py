@@ -75,7 +75,7 @@ class LiveDecoder:
         if address is None:
             return []
         at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
-        read = self._decoder.frame if address.topic.carries == "frame" else self._decoder.take
+        read = self._decoder.frame if address.topic.kind == "frame" else self._decoder.take
         return read(address, received.payload, at_ns)
 
 

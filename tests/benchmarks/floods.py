@@ -64,7 +64,7 @@ WELL_FORMED: Final = {
 
 def payloads(topic: Topic) -> Iterator[bytes]:
     """What a stranger sends on a topic, over and over."""
-    limit = topic.request if topic.carries == "query" else topic.limit
+    limit = topic.request if topic.kind == "query" else topic.limit
     keys = ",".join(f'"k{number}":0' for number in range(limit // 9))[: limit - 2].rpartition(",")[0]
     kinds = [
         os.urandom(min(limit, 16_384)),
@@ -94,13 +94,13 @@ def flood(rendezvous: str, name: str, seconds: float) -> None:
         for number, (key, payload) in enumerate(zip(keys, payloads(topic), strict=False)):
             if time.monotonic() > until:
                 break
-            if topic.carries == "token":
+            if topic.kind == "token":
                 holder = (f"{os.getpid()}-{number}", "plant", "recorder", "*")[number % 4]
                 tokens.append(session.liveliness().declare_token(f"aeroloop/aero/alive/{holder}"))
                 if len(tokens) >= 1000:
                     while tokens:
                         tokens.pop().undeclare()
-            elif topic.carries == "query":
+            elif topic.kind == "query":
                 session.get(key, RingChannel(1), payload=payload, timeout=1.0)
             else:
                 session.put(key, payload)
@@ -184,7 +184,7 @@ def stand_by(endpoint: str) -> None:
     tree = {"listen": {"endpoints": [endpoint]}, **NO_SCOUTING}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
         for topic in topics.TOPICS.values():
-            if topic.carries == "query":
+            if topic.kind == "query":
                 session.declare_queryable(topics.key(topic.name, "*"), RingChannel(1))
             else:
                 session.declare_subscriber(topics.key(topic.name, "*"), RingChannel(1))

@@ -30,8 +30,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from aeroloop.protocol.messages.intake import IntakeError, read
-from aeroloop.protocol.messages.operator import build_messages
+from aeroloop.protocol.messages.operator import MessageError
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.cli.main import execute
@@ -75,7 +74,6 @@ def frames(chance: Random) -> Failures:
 
 def messages(chance: Random) -> Failures:
     """Mutated messages, each against its own model and another one."""
-    build_messages()
     models = sorted({type(message) for message in MESSAGES}, key=lambda model: model.__name__)
     refused, slowest = 0, 0.0
     for number in range(PAYLOADS):
@@ -84,8 +82,8 @@ def messages(chance: Random) -> Failures:
         model = type(message) if number % 2 else chance.choice(models)
         begun = time.thread_time()
         try:
-            read(model, payload)
-        except IntakeError as error:
+            model.decode(payload)
+        except MessageError as error:
             refused += 1
             if len(str(error).splitlines()) != 1:
                 yield f"{model.__name__} {payload!r}: {error}"

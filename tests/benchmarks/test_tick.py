@@ -17,8 +17,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.lab.experiment import run_experiment

@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.can_in_process import virtual
 from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually

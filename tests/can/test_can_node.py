@@ -14,7 +14,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.can_in_process import Flaws, Stranger, virtual
 from tests.support.can_stage import Bus
 from tests.support.plant_end import COUNTERS, OFF, WIRE, claim_of, command, volts

@@ -11,9 +11,8 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil
@@ -62,12 +61,12 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
             frame = bytes((wire.command if end == "plant" else wire.measurement).size)
             identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
             stranger.say(identifier, frame)
-            stranger.say(identifier, SILENCE)
+            stranger.say(identifier, UNCHANGED)
             stranger.settle(link)
             arrival = link.take()
             assert arrival is not None
             expected = lockstep and policy == "on_change"
-            assert (arrival.frame, link.refused) == ((SILENCE, 0) if expected else (frame, 1))
+            assert (arrival.frame, link.refused) == ((UNCHANGED, 0) if expected else (frame, 1))
     finally:
         link.close()
 
@@ -88,10 +87,10 @@ def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanNetwork, Stranger,
 
 def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanNetwork, Stranger, bool]) -> None:
     front, stranger, lockstep = node
-    for frame in (measurement(0), SILENCE, SILENCE, measurement(3)):
+    for frame in (measurement(0), UNCHANGED, UNCHANGED, measurement(3)):
         front.send(frame)
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
-    silence = [SILENCE, SILENCE] if lockstep else []
+    silence = [UNCHANGED, UNCHANGED] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
 
 

@@ -14,7 +14,7 @@ from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.can_stage import measurement
 from tests.support.plant_end import COUNTERS, OFF, PERIOD_NS, WIRE, claim_of, command, volts
 from tests.support.simulated_link import wire_of
@@ -164,20 +164,20 @@ def test_while_it_is_unavailable_claims_are_refused_and_clear_no_latch() -> None
 
 def test_silence_passes_in_lockstep_after_a_sessions_first_frame_and_has_the_counter_after_the_last() -> None:
     it = granted(BOTH, lockstep=True)
-    assert it.measurement(SILENCE) is it.command(SILENCE, NOW) is None
+    assert it.measurement(UNCHANGED) is it.command(UNCHANGED, NOW) is None
     assert (it.session_tick, it.refused) == (-1, 1)  # the command was no first one
     assert it.measurement(measurement(0)) is not None
     for k in range(1, 15):
-        assert it.measurement(SILENCE) == SILENCE
+        assert it.measurement(UNCHANGED) == UNCHANGED
         assert it.counter == k
     assert it.command(command(0), NOW) is not None
-    assert it.command(SILENCE, NOW) == SILENCE
+    assert it.command(UNCHANGED, NOW) == UNCHANGED
     assert it.refused == 1
 
 
 @pytest.mark.parametrize(("wire", "lockstep"), [(BOTH, False), (WIRE, True), (WIRE, False)])
 def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpec, lockstep: bool) -> None:
     it = driven(wire, lockstep=lockstep)
-    assert it.measurement(SILENCE) is it.command(SILENCE, NOW + WATCHDOG_NS - 1) is None
+    assert it.measurement(UNCHANGED) is it.command(UNCHANGED, NOW + WATCHDOG_NS - 1) is None
     assert it.refused == 2
     assert it.watch(NOW + WATCHDOG_NS) == (not lockstep)

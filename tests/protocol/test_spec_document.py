@@ -115,11 +115,11 @@ def test_the_quantizer_gives_its_golden_vectors(row: Row) -> None:
     if isnan(float(value)):
         assert number(code) == quantizer.invalid
         assert isnan(float(level))
-        assert isnan(quantizer.decode(number(code)))
+        assert isnan(quantizer.level(number(code)))
         return
     assert quantizer.encode(float(value)) == number(code)
     # The text gives at least twelve significant digits; zero is exact.
-    assert quantizer.decode(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
+    assert quantizer.level(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize("row", KIND_ROWS, ids=" ".join)
@@ -132,10 +132,10 @@ def test_the_other_kinds_give_their_golden_vectors(row: Row) -> None:
         if isnan(float(value)):
             assert number(code) == quantizer.invalid
             quantizer.resume(quantizer.invalid)
-            assert isnan(quantizer.decode(number(code)))
+            assert isnan(quantizer.level(number(code)))
             continue
         assert quantizer.encode(float(value)) == number(code)
-        assert quantizer.decode(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
+        assert quantizer.level(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
@@ -188,7 +188,7 @@ def test_queries_pages_and_attachments_are_their_golden_vectors(row: Row) -> Non
 
 def longest(topic: Topic) -> int:
     """Most bytes of a request or its answer, or of what is published."""
-    return max(topic.request, topic.limit) if topic.carries == "query" else topic.limit
+    return max(topic.request, topic.limit) if topic.kind == "query" else topic.limit
 
 
 def size(count: int) -> str:
@@ -214,7 +214,7 @@ def test_the_table_of_topics_is_that_of_the_code() -> None:
             topic.key,
             {*topic.senders},
             {*topic.receivers},
-            "–" if topic.carries == "token" else size(longest(topic)),
+            "–" if topic.kind == "token" else size(longest(topic)),
         )
         for topic in TOPICS.values()
     }

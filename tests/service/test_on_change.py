@@ -11,7 +11,7 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service import examples
 from aeroloop.service.config import ConfigError, Settings, load, with_bits
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
@@ -90,7 +90,7 @@ def test_silence_is_computed_as_the_frame_that_was_not_sent_would_be() -> None:
     for k in range(60):
         changed = k in (0, 7, 30)
         yaw = 0.1 if k < 7 else 0.3 if k < 30 else -0.2
-        assert sparse.tick(measurement(k, yaw) if changed else SILENCE, k) == periodic.tick(measurement(k, yaw), k)
+        assert sparse.tick(measurement(k, yaw) if changed else UNCHANGED, k) == periodic.tick(measurement(k, yaw), k)
         assert (sparse.voltages, sparse.law_state) == (periodic.voltages, periodic.law_state)
         assert (sparse.tick_index, sparse.counter) == (k, k % COUNTERS)
 
@@ -103,7 +103,7 @@ def test_a_command_is_sent_when_its_codes_change_or_the_heartbeat_is_due() -> No
         assert frame is not None
         codes = frame[1:]
         due = codes != last or k - sent_at == 15
-        assert sparse.tick(measurement(k), k) == (frame if due else SILENCE)
+        assert sparse.tick(measurement(k), k) == (frame if due else UNCHANGED)
         if due:
             last, sent_at = codes, k
 
@@ -112,12 +112,12 @@ def test_a_command_is_sent_when_its_codes_change_or_the_heartbeat_is_due() -> No
 def test_an_empty_frame_is_refused_where_it_can_stand_for_nothing(wire: WireSpec) -> None:
     """Before a session's first frame, and on a wire that has a frame every tick."""
     law = controller(wire)
-    assert law.tick(SILENCE, 0) is None
+    assert law.tick(UNCHANGED, 0) is None
     assert law.refused == 1
-    assert law.attitude_of(SILENCE) is None
+    assert law.attitude_of(UNCHANGED) is None
     assert law.tick(measurement(1), 1)
-    answered = law.tick(SILENCE, 2)
-    assert (answered is None, law.refused, law.attitude_of(SILENCE) is None) == (
+    answered = law.tick(UNCHANGED, 2)
+    assert (answered is None, law.refused, law.attitude_of(UNCHANGED) is None) == (
         (False, 1, False) if wire is WIRE else (True, 2, True)
     )
 
@@ -126,13 +126,13 @@ def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_ho
     late, in_time = controller(), controller()
     for law in (late, in_time):
         law.tick(measurement(0), 0)
-        law.tick(SILENCE, 1)
+        law.tick(UNCHANGED, 1)
     assert late.hold(measurement(1, 0.3))
-    assert not late.hold(SILENCE)
+    assert not late.hold(UNCHANGED)
     assert not late.hold(measurement(1)[:-1])
     assert late.refused == 2
     assert late.tick_index == 1  # nothing was computed
-    assert late.tick(SILENCE, 2) == in_time.tick(measurement(2, 0.3), 2)
+    assert late.tick(UNCHANGED, 2) == in_time.tick(measurement(2, 0.3), 2)
 
 
 @pytest.mark.parametrize("at", [0, 1, 5, 9, 23])
@@ -144,7 +144,7 @@ def test_a_restored_controller_goes_on_with_the_levels_it_held_and_what_it_sent(
         for k in ticks:
             if k == 9:
                 assert law.hold(measurement(8, 0.3))
-            said.append(law.tick(measurement(k, 0.2) if k in (0, 20) else SILENCE, k))
+            said.append(law.tick(measurement(k, 0.2) if k in (0, 20) else UNCHANGED, k))
         return said
 
     law, restored = controller(), controller()

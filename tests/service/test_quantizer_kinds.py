@@ -142,7 +142,7 @@ def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, 
     codes = [frame[1] for frame in sent if frame is not None]
     assert len(codes) == 200
     for i, name in enumerate(("voltage_2", "voltage_3")):
-        assert table[f"{name}_V"] == [quantizer.decode(both[i]) for both in codes]
+        assert table[f"{name}_V"] == [quantizer.level(both[i]) for both in codes]
         assert table[f"saturated_{name}"] == [abs(both[i]) == 31 for both in codes]
     seen = [wire.measurement.unpack(frame.tobytes()) for frame in block.controller["measurement"]]
     level = wire.rate.quantizer().level

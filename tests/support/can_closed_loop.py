@@ -12,7 +12,7 @@ from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.figures import Figures, Score
@@ -50,9 +50,9 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
             if read := wire.command.unpack(command):
                 voltages = [level(code) for code in read[1]]
             else:
-                assert command == SILENCE
-            score.error(k, controller.attitude_error, sent=arrival.frame != SILENCE)
-            score.command(k, voltages, sent=command != SILENCE)
+                assert command == UNCHANGED
+            score.error(k, controller.attitude_error, sent=arrival.frame != UNCHANGED)
+            score.command(k, voltages, sent=command != UNCHANGED)
             link.send(command)
     finally:
         over.set()

@@ -13,7 +13,7 @@ from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.can_in_process import Stranger
 from tests.support.plant_end import COUNTERS, PERIOD_NS, WIRE, RecordingPlant, command
 from tests.support.zenoh_network import PATIENCE_S

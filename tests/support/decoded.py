@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.models import (
     Truth,
 )
 from aeroloop.protocol.messages.operator import Setpoint
-from aeroloop.protocol.messages.trace import End, Outcome, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.protocol.messages.trace import Received as ReceivedAs
 from aeroloop.protocol.wire.attitude import Quaternion
 from aeroloop.protocol.wire.frames import FrameFormat
@@ -104,10 +104,10 @@ def batch(end: End, rows: list[tuple[int, Sent, bytes]], wire: WireSpec = WIRE) 
         if end == "plant":
             echo = bytes(wire.command.size)
             volts = [0.0] * wire.actuators
-            writer.plant_row(tick, tick, sent_as, Sent.NONE, Outcome.NONE, 0, -1, sent_ns, 0, frame, echo, volts)
+            writer.row(PlantRow(tick, tick, sent_as, Sent.NONE, Outcome.NONE, 0, -1, sent_ns, 0, frame, echo, volts))
         else:
             taken = bytes(wire.measurement.size)
-            writer.controller_row(tick, ReceivedAs.FRAME, sent_as, sent_ns - 200_000, sent_ns, taken, frame)
+            writer.row(ControllerRow(tick, ReceivedAs.FRAME, sent_as, sent_ns - 200_000, sent_ns, taken, frame))
     return writer.take(NOW - ahead_ns, NOW)
 
 

@@ -110,12 +110,13 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
             return one
         batch = read_batch(one.data)
         assert batch is not None
-        columns = batch.columns.copy()
+        columns = {name: column.copy() for name, column in batch.columns.items()}
         edit(columns)
-        for name in set(STEPS) & set(columns.dtype.names or ()):
+        for name in set(STEPS) & set(columns):
             columns[name] = np.diff(columns[name], prepend=columns[name].dtype.type(0))
-        at = HEADER_BYTES + columns.nbytes
-        return one._replace(data=one.data[:HEADER_BYTES] + columns.tobytes() + one.data[at:])
+        packed = b"".join(column.tobytes() for column in columns.values())
+        at = HEADER_BYTES + len(packed)
+        return one._replace(data=one.data[:HEADER_BYTES] + packed + one.data[at:])
 
     return change
 

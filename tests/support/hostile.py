@@ -5,12 +5,12 @@ from __future__ import annotations
 from random import Random
 from typing import Final
 
-from aeroloop.protocol.messages.intake import FEW
+from aeroloop.protocol.messages.operator import MAX_VALUES
 
 TOKENS: Final = (
     b"null", b"true", b"NaN", b"-Infinity", b"1e999", b"-0.0", b"9" * 400, b"0." + b"1" * 400, b'""', b"[]", b"{}",
     b'"\\ud800"', b'"\\u0000"', b"\xff\xfe", b"[" * 300,
-    b'{"a":' * 300, b'"k":0,' * (FEW + 1), b'"' + b"x" * 5000 + b'"',
+    b'{"a":' * 300, b'"k":0,' * (MAX_VALUES + 1), b'"' + b"x" * 5000 + b'"',
 )  # fmt: skip
 """What is put in the place of something else."""
 

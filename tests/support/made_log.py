@@ -19,7 +19,7 @@ from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
-from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.messages.trace import ControllerRow, End, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.transport.history import Delivery as Message
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.service.config import Settings, load
@@ -145,10 +145,10 @@ class ControllerEnd:
 
     def record(self, tick: PlantTick, command: bytes | None, sent_ns: int) -> None:
         sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
-        self.trace.controller_row(
+        self.trace.row(ControllerRow(
             max(tick.tick, 0), tick.received_as, sent_as, tick.at_ns, sent_ns if command is not None else 0,
             tick.frame, command or b"",
-        )  # fmt: skip
+        ))  # fmt: skip
         if self.trace.due(self._clock.monotonic_ns()):
             self.publish()
             self.trace.state = self.controller.state.model_dump(mode="json")

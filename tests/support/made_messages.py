@@ -9,7 +9,7 @@ from typing import NamedTuple
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import ControllerRow, Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.protocol.messages.trace import Received as ReceivedAs
 from aeroloop.service.config import Settings
 
@@ -59,14 +59,14 @@ class Ends:
         """What tick k publishes, now on the monotonic and on the wall clock [ns]."""
         measurement = self._wire.measurement.pack(k & 15, [self._random.randrange(-20, 20) for _ in range(6)])
         command = self._wire.command.pack(k & 15, [self._random.randrange(-5, 5) for _ in range(self._wire.actuators)])
-        self._plant.plant_row(
+        self._plant.row(PlantRow(
             k, k, Sent.FRAME, Sent.FRAME, Outcome.ACTED, 0, k - 1, now_ns, now_ns - 1_000_000, measurement, command,
             [self._random.uniform(-18, 18) for _ in range(self._wire.actuators)],
-        )  # fmt: skip
+        ))  # fmt: skip
         if k in self._changes:
             self._controller.changes.append(self._changes[k])
-        self._controller.controller_row(
-            k, ReceivedAs.FRAME, Sent.FRAME, now_ns + 200_000, now_ns + 300_000, measurement, command
+        self._controller.row(
+            ControllerRow(k, ReceivedAs.FRAME, Sent.FRAME, now_ns + 200_000, now_ns + 300_000, measurement, command)
         )
         if k % self._rows == self._rows - 1:
             yield Published("trace", "plant", self._plant.take(now_ns, wall_ns))

@@ -20,9 +20,8 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.plant_end import claim_of
 
 RUN = 0x0123_4567_89AB_CDEF
@@ -89,7 +88,7 @@ class Stage(PlantNetwork):
         wire: What the frames are.
         plant: The emulator.
         between: Called between ticks.
-        answer: Called with every measurement that is sent; SILENCE in lockstep only.
+        answer: Called with every measurement that is sent; UNCHANGED in lockstep only.
         skip: Ticks to skip before the next.
         driver: Instead of an emulator.
 
@@ -170,7 +169,7 @@ class Stage(PlantNetwork):
 
     def send(self, frame: bytes) -> None:
         """Have it answered, at once or later."""
-        if frame != SILENCE or self.loop.lockstep:
+        if frame != UNCHANGED or self.loop.lockstep:
             self.sent.append(frame)
             self._answer(self, frame)
 

@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Gains, Hold
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings, load
 from aeroloop.service.daemon.tick_source import MAILBOX, TickSource
 from tests.support.clock import FakeClock
@@ -33,7 +33,7 @@ class Known:
     Attributes:
         settings: The configuration.
         messages: What a recorder would have taken in.
-        measured: Frames that the plant made, by session tick; SILENCE where it sent none.
+        measured: Frames that the plant made, by session tick; UNCHANGED where it sent none.
         commands: What the controller sent at each tick that it computed.
         late: Measurements that came late.
         acted: When the plant received the command that it acted on, on its clock, by the tick that it answers [ns].
@@ -115,7 +115,7 @@ class World(FakeClock, Link):
         sent_ns = self._plant_clock.monotonic_ns()
         at_ns = now_ns
         for frame in self.emulator._outgoing(measurement):
-            if frame != SILENCE:
+            if frame != UNCHANGED:
                 at_ns += 1000
                 self._send(self._to_controller, frame, at_ns)
         self.trace.row(endpoint, measurement, arrival, sent_ns)

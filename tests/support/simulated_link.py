@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import Policy, Transmit
 from tests.support.clock import FakeClock
 

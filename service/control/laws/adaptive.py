@@ -31,7 +31,7 @@ from typing import Annotated, ClassVar, Final, Literal
 import casadi as ca
 from pydantic import AfterValidator, Field, model_validator
 
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
 from aeroloop.service.control.laws.interface import MAX_GAIN, ExpressionLaw, LawSettings, Now, Vector
 

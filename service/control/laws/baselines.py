@@ -35,7 +35,7 @@ import casadi as ca
 import numpy as np
 from pydantic import Field, NonNegativeFloat
 
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
 from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
 from aeroloop.service.control.laws.interface import Diagonal, ExpressionLaw, Floats, Gains3, LawSettings, Now, Vector

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import LawSettings
 
 

@@ -8,9 +8,9 @@ from typing import Any, Final, NamedTuple
 import casadi as ca
 import numpy as np
 
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.protocol.wire.expressions import as_written
-from aeroloop.protocol.wire.rotations import R, S
-from aeroloop.protocol.wire.symbolic import along_rows, in_columns
+from aeroloop.service.control.columns import along_rows, in_columns
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, Now, PythonLaw
 
 
@@ -65,11 +65,11 @@ def law_function(law: ExpressionLaw[Any]) -> ca.Function:
 def law_of_many(law: ExpressionLaw[Any], rows: int) -> ca.Function:
     """Many consecutive ticks of a law of expressions, for readers of logs. Raises as `law_function` does.
 
-    Attitude and state go from row to row; all else is computed in columns (protocol/wire/symbolic.py).
+    Attitude and state go from row to row; all else is computed in columns (service/control/columns.py).
 
     Args:
         law: The law.
-        rows: How many ticks; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
+        rows: How many ticks; a multiple of `aeroloop.service.control.columns.UNROLLED`.
 
     Returns:
         A function with the inputs of `law_function`: `last` and `state` are those before the first tick, all others

@@ -14,7 +14,7 @@ from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY
-from aeroloop.protocol.wire.transmit import SILENCE, Policy
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from tests.support.plant_end import COUNTERS, OFF, RecordingPlant, claim_of, claimed, command, state_of, volts
 from tests.support.simulated_link import wire_of
 
@@ -49,7 +49,7 @@ def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bo
         plant.now = turning(0.5 if k >= 40 else 0.001)  # which is less than half a step
         frame = endpoint.tick(command(k - 1), k)
         assert frame is not None  # silence is distinguished from no session
-        if frame != SILENCE:
+        if frame != UNCHANGED:
             sent[k] = BOTH.measurement.unpack(frame)
     changed = (0, 0, 0, 64, 0, 0)
     assert sent == {15: (15, (0,) * 6), 30: (30, (0,) * 6), 40: (40, changed), 55: (55, changed)}
@@ -81,7 +81,7 @@ def test_no_valid_value_is_said_once_held_and_ended_by_the_next_frame() -> None:
 
 @pytest.mark.parametrize("policy", ["on_change", "periodic"])
 def test_in_real_time_no_frame_holds_for_the_watchdogs_time_and_an_empty_one_is_refused(policy: Policy) -> None:
-    for frame in (None, SILENCE):
+    for frame in (None, UNCHANGED):
         endpoint, plant = claimed(wire_of("on_change", policy))
         for k in range(1, 80):
             endpoint.tick(command(k - 1) if k in (1, 16) else frame, k)
@@ -93,7 +93,7 @@ def test_in_real_time_no_frame_holds_for_the_watchdogs_time_and_an_empty_one_is_
 def test_an_empty_command_in_lockstep_is_refused_where_commands_are_periodic() -> None:
     endpoint, _ = claimed(wire_of("on_change", "periodic"), lockstep=True)
     endpoint.tick(command(0), 1)
-    endpoint.tick(SILENCE, 2)
+    endpoint.tick(UNCHANGED, 2)
     assert (endpoint.refused, endpoint.accepted) == (1, 1)
 
 
@@ -101,12 +101,12 @@ def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_non
     endpoint, plant = claimed(BOTH, lockstep=True)
     endpoint.tick(command(0, 7), 1)
     for k in range(2, 300):
-        endpoint.tick(SILENCE, k)
+        endpoint.tick(UNCHANGED, k)
     assert plant.held == [volts(7)] * 299
     assert (endpoint.accepted, endpoint.refused, state_of(endpoint)) == (299, 0, PlantState.DRIVEN)
     claim_again(endpoint)
     endpoint.tick(None, 300)
-    endpoint.tick(SILENCE, 301)
+    endpoint.tick(UNCHANGED, 301)
     assert plant.held[299:] == [OFF, OFF]
     assert (endpoint.refused, state_of(endpoint)) == (1, PlantState.GRANTED)
 
@@ -115,14 +115,14 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
     endpoint, plant = claimed(BOTH, lockstep=True)
     endpoint.tick(command(0), 1)
     plant.now = turning(nan)
-    endpoint.tick(SILENCE, 2)
+    endpoint.tick(UNCHANGED, 2)
     endpoint.tick(invalid(2), 3)
-    endpoint.tick(SILENCE, 4)
+    endpoint.tick(UNCHANGED, 4)
     plant.now = turning(0.0)
-    endpoint.tick(SILENCE, 5)
+    endpoint.tick(UNCHANGED, 5)
     assert plant.held == [volts(), volts(), OFF, OFF, OFF]
     assert state_of(endpoint) is PlantState.DRIVEN
-    endpoint.tick(SILENCE, 6)  # answers a valid measurement
+    endpoint.tick(UNCHANGED, 6)  # answers a valid measurement
     assert endpoint.trip is TripCause.INVALID_COMMAND
 
 

@@ -13,9 +13,8 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent, batches_per_s
 from aeroloop.protocol.transport.history import KEPT_S
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Transmit
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Transmit
 from tests.support.plant_stage import RUN, Stage
 
 LOOP = LoopSettings(realtime="off", trace_s=10)
@@ -127,7 +126,7 @@ def test_a_trip_is_the_sessions_last_row_with_its_cause(
     [
         (WIRE.command.pack(38, (3, -3)) + b"\0", Sent.MALFORMED, Outcome.MALFORMED),  # the rest would be fresh
         (b"\1", Sent.MALFORMED, Outcome.MALFORMED),
-        (SILENCE, Sent.SILENT, Outcome.MALFORMED),
+        (UNCHANGED, Sent.SILENT, Outcome.MALFORMED),
         (b"\xff" * WIRE.command.size, Sent.FRAME, Outcome.MALFORMED),
         (WIRE.command.pack(3, (31, 31)), Sent.FRAME, Outcome.REPEATED),
     ],

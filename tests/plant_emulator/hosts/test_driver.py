@@ -13,8 +13,7 @@ from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.own_laws import Node, cycle
 from tests.support.own_plants import Turntable, TurntableSettings
 from tests.support.plant_end import claim_of

@@ -19,8 +19,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import FaultStatus
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.plant_stage import Stage, Wires
 
 WIRE = WireSpec()

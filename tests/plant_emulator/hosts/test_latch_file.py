@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.models import Event, Grant, Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 

@@ -13,8 +13,7 @@ from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
 from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.own_plants import Turntable
 from tests.support.plant_stage import Stage
 

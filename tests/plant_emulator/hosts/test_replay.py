@@ -21,9 +21,8 @@ from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, PlantChangeKind
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Transmit
+from aeroloop.protocol.wire.spec import LoopSettings, SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Transmit
 from tests.support.plant_stage import Stage
 
 TICKS = 400
@@ -81,8 +80,8 @@ class Mischief:
             codes = [self._invalid] * len(codes)
         frame = command.pack(counter, codes)
         if stage.loop.lockstep:
-            if measurement == SILENCE or (self._wire.transmit.command == "on_change" and random.random() < 0.3):
-                frame = SILENCE
+            if measurement == UNCHANGED or (self._wire.transmit.command == "on_change" and random.random() < 0.3):
+                frame = UNCHANGED
             if random.random() > 0.002:
                 wires.deliver(frame, now)
             return
@@ -90,7 +89,7 @@ class Mischief:
         if chance < 0.05:
             return
         if chance < 0.1:
-            frame = random.choice((SILENCE, frame[:-1], frame + b"\0", random.randbytes(len(frame))))
+            frame = random.choice((UNCHANGED, frame[:-1], frame + b"\0", random.randbytes(len(frame))))
         wires.deliver(frame, now + (random.randint(0, self._late) if chance < 0.5 else 0))
         if chance > 0.9:
             wires.deliver(frame, now + random.randint(1, 4))
@@ -194,7 +193,7 @@ def test_a_row_that_was_changed_is_found(row: int, bit: int, column: str) -> Non
     loop, wire, batches = undisturbed()
     at = next(i for i, b in enumerate(batches) if b.header.first_row <= row < b.header.first_row + b.header.rows)
     batch = batches[at]
-    columns = np.frombuffer(bytearray(np.array(batch.columns).tobytes()), batch.columns.dtype)[0]
+    columns = {name: each.copy() for name, each in batch.columns.items()}
     size = columns[column].nbytes // batch.header.rows
     changed = columns[column].view(np.uint8).reshape(batch.header.rows, size)
     changed[row - batch.header.first_row, 0] ^= 1 << bit

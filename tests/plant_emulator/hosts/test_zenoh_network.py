@@ -19,7 +19,7 @@ from aeroloop.protocol.runtime.node import Node, OccupiedError
 from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 

@@ -32,40 +32,28 @@ def test_a_key_is_read_back_as_what_it_was_made_from(topic: Topic, vehicle: str,
 
 
 @every_topic
-def test_what_is_left_out_of_a_key_is_a_wildcard(topic: Topic) -> None:
-    pattern = zenoh.KeyExpr(key(topic.name, "aero"))
-    assert pattern.includes(zenoh.KeyExpr(key(topic.name, "aero", session="s1", role="plant")))
+def test_what_is_left_out_of_a_key_is_a_wildcard_and_others_have_other_keys(topic: Topic) -> None:
+    pattern, mine = zenoh.KeyExpr(key(topic.name, "aero")), key(topic.name, "aero", session="s1", role="plant")
+    assert pattern.includes(zenoh.KeyExpr(mine))
     assert not pattern.intersects(zenoh.KeyExpr(key(topic.name, "other", session="s1", role="plant")))
+    assert (mine == key(topic.name, "aero", session="s2", role="recorder")) == ("{" not in topic.key)
 
 
-def test_what_is_published_is_either_recorded_or_a_frame() -> None:
-    published = [topic.name for topic in TOPICS.values() if topic.carries not in ("query", "token")]
+def test_every_topic_has_a_name_and_a_key_of_its_own_and_is_recorded_if_it_is_published_and_no_frame() -> None:
+    assert [topic.name for topic in TOPICS.values()] == list(TOPICS)
+    assert len({topic.key for topic in TOPICS.values()}) == len(TOPICS)
+    published = [topic.name for topic in TOPICS.values() if topic.kind not in ("query", "token")]
     assert sorted(RECORDED + FRAMES) == sorted(published)
     assert FRAMES == ("measurement", "command")
 
 
 @every_topic
-def test_sessions_and_roles_of_others_have_other_keys(topic: Topic) -> None:
-    mine = zenoh.KeyExpr(key(topic.name, "aero", session="s1", role="plant"))
-    theirs = zenoh.KeyExpr(key(topic.name, "aero", session="s2", role="recorder"))
-    assert mine.intersects(theirs) == ("{" not in topic.key)
-
-
-def test_every_topic_is_called_what_the_table_calls_it_and_has_a_key_of_its_own() -> None:
-    assert [topic.name for topic in TOPICS.values()] == list(TOPICS)
-    assert len({topic.key for topic in TOPICS.values()}) == len(TOPICS)
-
-
-@every_topic
-def test_what_several_roles_publish_has_the_role_in_its_key(topic: Topic) -> None:
-    """Access rules compare keys, not payloads: on a shared key a recorder could publish an event of the plant's."""
-    assert topic.carries == "query" or ("{role}" in topic.key) == (len(topic.senders) > 1)
-
-
-@every_topic
-def test_every_json_topic_has_a_model_and_no_frame_trace_or_token_has_one(topic: Topic) -> None:
-    if topic.carries != "query":
-        assert (topic.model is not None) == (topic.carries == "json")
+def test_a_topic_s_kind_says_what_else_it_has(topic: Topic) -> None:
+    assert ("observer" in topic.receivers) == (topic.kind != "query")  # whatever is published may be observed
+    if topic.kind != "query":
+        assert (topic.model is not None) == (topic.kind == "json")
+        # Access rules compare keys, not payloads: on a shared key a recorder could publish an event of the plant's.
+        assert ("{role}" in topic.key) == (len(topic.senders) > 1)
 
 
 def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
@@ -78,7 +66,7 @@ def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
         | {"reference"},
         "observer": {"show"},
     }
-    queries = [topic for topic in TOPICS.values() if topic.carries == "query"]
+    queries = [topic for topic in TOPICS.values() if topic.kind == "query"]
     assert {role: {topic.name for topic in queries if role in topic.receivers} for role in ROLES} == {
         "plant": {"claim", "release", "record", "show", "arm", "stop", "inject", "advance"},
         "controller": {"show", "set_gains", "track", "stand_down", "recall"},
@@ -86,11 +74,6 @@ def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
         "observer": set(),
         "recorder": set(),
     }
-
-
-@every_topic
-def test_whatever_is_published_may_be_observed(topic: Topic) -> None:
-    assert ("observer" in topic.receivers) == (topic.carries != "query")
 
 
 def test_an_unknown_topic_has_no_key() -> None:

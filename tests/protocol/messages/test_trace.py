@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,9 +20,13 @@ from aeroloop.protocol.messages.trace import (
     HEADER_BYTES,
     MAX_ROWS,
     NEVER,
+    ControllerRow,
     End,
+    Header,
     PlantChange,
+    PlantRow,
     TraceWriter,
+    join_columns,
     read_batch,
     row_dtype,
 )
@@ -49,7 +54,7 @@ def _value(cell: str) -> Any:
 
 
 def add(writer: TraceWriter, row: Sequence[Any]) -> None:
-    (writer.controller_row if writer.end == "controller" else writer.plant_row)(*row)
+    writer.row((ControllerRow if writer.end == "controller" else PlantRow)(*row))
 
 
 def test_the_golden_batch_of_the_controller_is_what_the_writer_writes() -> None:
@@ -112,49 +117,74 @@ def test_numpy_reads_the_golden_batches_by_the_text_alone(end: End) -> None:
     json.loads(batch[at:])
 
 
-frames = st.binary(min_size=7, max_size=7)
-times = st.integers(10 * S, 12 * S)
-
-
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 2**32 - 2), st.integers(0, 3), st.integers(0, 2), times, times | st.just(0), frames,
-                  st.binary(min_size=3, max_size=3)),
-        min_size=1, max_size=MAX_ROWS,
-    ),
-    st.booleans(),
+at_ns = st.integers(10 * S, 12 * S)
+ticks = st.integers(0, 2**32 - 2)
+acts = st.integers(0, 3)
+frames = st.binary(min_size=7, max_size=7), st.binary(min_size=3, max_size=3)
+volts = st.tuples(*[st.floats(-24, 24)] * 2)
+controller_rows = st.builds(ControllerRow, ticks, acts, acts, at_ns, st.just(0) | at_ns, *frames)
+plant_rows = st.builds(
+    PlantRow, st.integers(0, 2**64 - 1), ticks, acts, acts, acts, acts, st.integers(-1, 2**32 - 2),
+    at_ns, st.just(0) | at_ns, *frames, volts,
 )  # fmt: skip
-def test_a_batch_reads_back_as_the_rows_that_were_added(rows: list[Any], final: bool) -> None:
-    writer = TraceWriter("controller", WIRE, 5, S)
-    writer.session, writer.state = "abc", {"sign": 1}
-    rows = [(row[0], row[1], row[2], max(row[3], rows[0][3]), *row[4:]) for row in rows]
-    for row in rows:
-        add(writer, row)
-    batch = read_batch(writer.take(13 * S, 77 * S, final=final))
-    assert batch is not None
-    header = batch.header
-    assert (header.rows, header.final, header.session, header.run) == (len(rows), final, "abc", 5)
-    assert header.wall_ns - header.monotonic_ns == 64 * S
-    assert batch.tail.state == {"sign": 1}
-    assert batch.columns["tick"].tolist() == [row[0] for row in rows]
-    assert [bytes(frame) for frame in batch.columns["measurement"]] == [row[5] for row in rows]
-    received = batch.times_ns("received")
-    assert all(0 <= row[3] - at < 1000 for row, at in zip(rows, received.tolist(), strict=True))
-    sent = batch.times_ns("sent").tolist()
-    before = rows[0][3] - S  # what lies before the base wraps; no end sends a second before it receives
-    assert all(at == -1 if not row[4] else row[4] < before or 0 <= row[4] - at < 1000
-               for row, at in zip(rows, sent, strict=True))  # fmt: skip
+
+
+def same(column: npt.NDArray[Any], added: list[Any]) -> bool:
+    """Whether a column has these values: numbers, frames or voltages."""
+    if column.dtype.kind == "V":
+        return [bytes(frame) for frame in column] == added
+    if column.dtype == np.uint32:
+        added = [value & NEVER for value in added]
+    return bool(np.array_equal(column.ravel(), np.array(added, column.dtype).ravel()))
+
+
+@pytest.mark.parametrize(("end", "drawn"), [("controller", controller_rows), ("plant", plant_rows)])
+@given(data=st.data(), final=st.booleans())
+def test_batches_read_back_as_the_rows_that_were_added_alone_and_joined(
+    end: End, drawn: st.SearchStrategy[Any], data: st.DataObject, final: bool
+) -> None:
+    writer = TraceWriter(end, WIRE, 5, S)
+    writer.session = "abc"
+    pieces = data.draw(st.lists(st.lists(drawn, max_size=20), min_size=1, max_size=3))
+    taken: list[tuple[Header, bytes]] = []
+    for rows in pieces:
+        writer.state = {"sign": 1}
+        for row in rows:
+            writer.row(row)
+        payload = writer.take(13 * S, 77 * S, final=final)
+        batch = read_batch(payload)
+        assert batch is not None
+        header = batch.header
+        assert (header.rows, header.final, header.session, header.run) == (len(rows), final, "abc", 5)
+        assert header.first_row == sum(before.rows for before, _ in taken)
+        assert header.wall_ns - header.monotonic_ns == 64 * S
+        assert batch.tail.state == {"sign": 1}
+        for name, column in batch.columns.items():
+            assert name in ("received", "sent") or same(column, [getattr(row, name) for row in rows])
+        for when, added in (
+            (batch.times_ns("received"), [row.received_ns for row in rows]),
+            (batch.times_ns("sent"), [row.sent_ns for row in rows]),
+        ):
+            for read_ns, added_ns in zip(when.tolist(), added, strict=True):
+                if added_ns == 0:
+                    assert read_ns == -1
+                elif added_ns >= header.monotonic_ns:  # what lies before the base wraps; no end sends so early
+                    assert 0 <= added_ns - read_ns < 1000
+        taken.append((header, payload))
+    for name, column in join_columns(taken).items():
+        if name not in ("received", "sent"):
+            assert same(column, [getattr(row, name) for rows in pieces for row in rows])
 
 
 def test_a_batch_is_due_when_it_is_full_or_its_first_row_has_waited_long_enough() -> None:
     writer = TraceWriter("controller", WIRE, 5, S // 10)
     assert not writer.due(10 * S)
-    writer.controller_row(0, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+    writer.row(ControllerRow(0, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
     assert not writer.due(10 * S + S // 10 - 1)
     assert writer.due(10 * S + S // 10)
     for k in range(1, MAX_ROWS):
         assert not writer.due(10 * S)
-        writer.controller_row(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+        writer.row(ControllerRow(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
     assert writer.due(10 * S)
 
 
@@ -168,6 +198,16 @@ def test_what_is_no_batch_is_refused_whole() -> None:
         for at, value in ((0, 1), (0, 3), (1, 2), (2, 2), (3, 0), (3, 9), (8, 99), (9, 2), (48, 200)):
             assert read_batch(batch[:at] + bytes([value]) + batch[at + 1 :]) is None, at
         assert read_batch(batch[:-1] + b"]") is None
+
+
+def test_a_batch_of_more_rows_than_one_may_have_or_with_bytes_after_them_is_refused() -> None:
+    writer = TraceWriter("controller", WIRE, 5, S)
+    for rows in (MAX_ROWS, MAX_ROWS + 1):
+        for k in range(rows):
+            writer.row(ControllerRow(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
+        batch = writer.take(11 * S, S)
+        assert (read_batch(batch) is not None) == (rows == MAX_ROWS)
+        assert read_batch(batch + b"\0") is None
 
 
 @given(st.binary(max_size=400))

@@ -9,9 +9,8 @@ from pathlib import Path
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.intake import FEW
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.operator import Answer, Message, Points, Request, Track
+from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
 from aeroloop.protocol.transport.certificate import read_certificate
 from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
@@ -69,7 +68,7 @@ def test_a_status_says_until_when_the_certificate_is_good(tmp_path: Path) -> Non
         assert gather(network).statuses["aero"]["plant"].certificate_until == mine.not_after
 
 
-LONG = Track(reference=Points(times=[float(n) for n in range(FEW)], attitudes=[(0.0, 0.0, 0.0)] * FEW))
+LONG = Track(reference=Points(times=[float(n) for n in range(MAX_VALUES)], attitudes=[(0.0, 0.0, 0.0)] * MAX_VALUES))
 
 
 def asked(role: Node, loop: Loop, topic: str, payload: bytes) -> Query:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, Throttle, TickGrid, report
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.clock import FakeClock
 
 START = 123_456_789_012_345

@@ -23,7 +23,7 @@ KEYS: Final = [
     for cache in (("", topics.cache_key("")) if topic.recorded else ("",))
 ]
 """Of one vehicle with rules and one without; with the key of a cache below each that is published from one."""
-VERBS: Final = {topics.key(topic.name, "aero") for topic in TOPICS.values() if topic.carries == "query"}
+VERBS: Final = {topics.key(topic.name, "aero") for topic in TOPICS.values() if topic.kind == "query"}
 OTHER_KEYS: Final = ["t/word", "aeroloop/aero/unknown", "aeroloop/aero", "aeroloop/aero/**", "**", "aeroloop/*/stop"]
 
 
@@ -37,7 +37,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 def may(role: RoleName, action: Action, topic: Topic) -> bool:
     """Whether the table lets a role do this with a topic."""
-    sending, receiving = topics.ACTIONS[topic.carries]
+    sending, receiving = topics.ACTIONS[topic.kind]
     return (action in sending and role in topic.senders) or (action in receiving and role in topic.receivers)
 
 
@@ -47,7 +47,7 @@ def allowed(role: RoleName, action: Action) -> set[str]:
     for key in KEYS:
         address = topics.read_key(topics.cached_key(key))
         assert address is not None
-        acts = action in topics.ACTIONS[address.topic.carries][0]
+        acts = action in topics.ACTIONS[address.topic.kind][0]
         if address.vehicle == "aero" and may(role, action, address.topic):
             found |= {key} if address.role in (None, role) or not acts else set()
     return found

@@ -187,9 +187,7 @@ def test_network_settings_out_of_bounds_are_refused_by_name(broken: dict[str, ob
         NetworkSettings.model_validate(broken)
 
 
-@pytest.mark.parametrize(
-    "topic", [topic for topic in TOPICS.values() if topic.carries != "token"], ids=lambda t: t.name
-)
+@pytest.mark.parametrize("topic", [topic for topic in TOPICS.values() if topic.kind != "token"], ids=lambda t: t.name)
 def test_what_exceeds_its_topics_limit_is_not_received(topic: Topic) -> None:
     """Neither published nor asked nor answered, while the longest that is allowed is; its publisher is a stranger."""
     key = topics.key(topic.name, "aero", session="s1", role="plant")

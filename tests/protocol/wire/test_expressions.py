@@ -2,41 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from array import array
 from functools import cache
 from math import copysign, inf, isnan, nan, nextafter
-from random import Random
 from threading import Event, Thread
+from typing import Final
 
 import casadi as ca
-import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.expressions import as_written, encode, level, saturates
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import CodedQuantizer, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, level, numbers, saturates, with_numbers
+from aeroloop.protocol.wire.quantizer import (
+    CodedQuantizer,
+    Continuous,
+    HysteresisQuantizer,
+    LogarithmicQuantizer,
+    Quantizer,
+    UniformQuantizer,
+)
 from aeroloop.protocol.wire.symbolic import Compiled
+from tests.protocol.wire.test_quantizer import quantizers
 
-LIMITS = (1.0, 24.0, 0.3)
-EVERY: tuple[Quantizer, ...] = (
-    *(UniformQuantizer(bits, limit) for bits in range(2, 17) for limit in LIMITS),
-    *(UniformQuantizer(bits, 1.0, 0.37) for bits in range(2, 17)),
-    *(HysteresisQuantizer(bits, limit) for bits in range(2, 17) for limit in LIMITS),
-    *(HysteresisQuantizer(bits, 24.0, 0.4, 0.05) for bits in range(2, 17)),
-    *(LogarithmicQuantizer(bits, limit) for bits in range(3, 17) for limit in LIMITS),
-    *(LogarithmicQuantizer(bits, 24.0, 0.4, 7.0) for bits in range(3, 17)),
+KINDS: Final = UniformQuantizer, HysteresisQuantizer, LogarithmicQuantizer
+FIXED: Final[tuple[Quantizer, ...]] = (
+    *(kind(bits, limit) for kind in KINDS for bits in range(3, 17) for limit in (1.0, 24.0, 0.3)),
+    *(kind(bits, 24.0, 0.4, 7.0) for kind in KINDS[1:] for bits in (3, 8, 16)),
+    *(UniformQuantizer(bits, 1.0, 0.37) for bits in (2, 8, 16)),
+    HysteresisQuantizer(2, 24.0, 0.4, 0.05),
     Continuous(24.0),
 )
+"""Quantizers whose parameters are constants of the expressions, as in a controller's tick."""
+
+
+def compiled(quantizer: Quantizer, parameters: ca.SX) -> Compiled:
+    """(y, held, code, parameters) ↦ (the code of y, the level of code, whether y saturates)."""
+    y, held, code = (ca.SX.sym(name) for name in ("y", "held", "code"))
+    with as_written():
+        found = [encode(quantizer, y, held), level(quantizer, code), saturates(quantizer, y)]
+    names = ["y", "held", "code", "parameters"], ["encoded", "level", "saturates"]
+    return Compiled(ca.Function("quantizer", [y, held, code, parameters], found, *names))
 
 
 @cache
-def compiled(which: int) -> Compiled:
-    """(y, held, code) ↦ (the code of y, the level of code, whether y saturates) of one of EVERY."""
-    y, held, code = (ca.SX.sym(name) for name in ("y", "held", "code"))
-    with as_written():
-        found = [encode(EVERY[which], y, held), level(EVERY[which], code), saturates(EVERY[which], y)]
-        names = ["y", "held", "code"], ["encoded", "level", "saturates"]
-        return Compiled(ca.Function("every", [y, held, code], found, *names))
+def of_constants(which: int) -> Compiled:
+    return compiled(FIXED[which], ca.SX(0, 0))
+
+
+@cache
+def of_numbers(kind: type[Quantizer]) -> Compiled:
+    """One function for all quantizers of a kind, whose parameters are inputs, as in the compiled loop."""
+    parameters = ca.SX.sym("parameters", len(NUMBERS))
+    quantizer = next(quantizer for quantizer in FIXED if type(quantizer) is kind)
+    return compiled(with_numbers(quantizer, parameters), parameters)
 
 
 def same(a: float, b: float) -> bool:
@@ -44,58 +62,48 @@ def same(a: float, b: float) -> bool:
     return (isnan(a) and isnan(b)) or (a == b and copysign(1, a) == copysign(1, b))
 
 
-def value(quantizer: Quantizer, held: float, random: Random) -> float:
-    """A value anywhere, a special one, or one within a few units in the last place of an edge, often of a near one."""
-    anywhere = random.uniform(-1.3, 1.3) * quantizer.limit
-    special = random.choice([0.0, -0.0, inf, -inf, 5e-324, quantizer.limit, -quantizer.limit])
-    if not isinstance(quantizer, CodedQuantizer):
-        return random.choice([anywhere, special])
-    near = 0 if isnan(held) else abs(int(held)) + random.randint(-2, 1)
-    i = min(quantizer.top, max(0, random.choice([near, random.randint(0, quantizer.top)])))
+@st.composite
+def values(draw: st.DrawFn, quantizer: Quantizer) -> float:
+    """A value anywhere, a special one, or one within a few units in the last place of an edge."""
+    if draw(st.booleans()) or not isinstance(quantizer, CodedQuantizer):
+        anywhere = st.floats(-1.3, 1.3).map(lambda part: part * quantizer.limit)
+        return draw(anywhere | st.sampled_from([0.0, -0.0, inf, -inf, 5e-324, quantizer.limit, -quantizer.limit]))
+    i = draw(st.integers(0, quantizer.top) | st.integers(0, min(3, quantizer.top)))
     if isinstance(quantizer, LogarithmicQuantizer):
-        edge = quantizer.edges[i]
+        edge: float = quantizer.edges[i]
     else:
         assert isinstance(quantizer, UniformQuantizer)
-        edge = quantizer.deadzone + i * quantizer.step + random.randint(-1, 1) * getattr(quantizer, "hysteresis", 0)
-    for _ in range(random.randint(0, 6)):
-        edge = nextafter(edge, random.choice([-inf, inf]))
-    return random.choice([anywhere, special, edge, edge, edge]) * random.choice([-1, 1])
+        band = draw(st.sampled_from((-1, 0, 1))) * getattr(quantizer, "hysteresis", 0)
+        edge = quantizer.deadzone + i * quantizer.step + band
+    towards = draw(st.sampled_from((-inf, inf)))
+    for _ in range(draw(st.integers(0, 6))):
+        edge = nextafter(edge, towards)
+    return edge if draw(st.booleans()) else -edge
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_codes_of_consecutive_values_are_the_quantizers(seed: int) -> None:
-    random = Random(seed)
-    for which, quantizer in enumerate(EVERY):
-        function, held = compiled(which), nan
-        quantizer.reset()
-        for _ in range(60):
-            y = value(quantizer, held, random)
-            function.inputs["y"][0], function.inputs["held"][0] = y, held
-            function()
-            held, before = function.outputs["encoded"][0], quantizer.saturated
-            assert same(held, float(quantizer.encode(y))), (quantizer.__dict__, y)
-            assert function.outputs["saturates"][0] == quantizer.saturated - before, (quantizer.__dict__, y)
-
-
-def levels() -> Iterator[tuple[int, float]]:
-    """Each code of few bits, and of many bits the outermost, the innermost and some between."""
-    for which, quantizer in enumerate(EVERY):
-        if isinstance(quantizer, CodedQuantizer):
-            top = quantizer.top
-            some = range(top + 1) if top < 300 else {*range(9), *range(top - 9, top + 1), *range(0, top, top // 99)}
-            yield from ((which, sign * code) for code in some for sign in (1.0, -1.0))
-            yield which, quantizer.invalid
-        else:
-            yield from ((which, code) for code in (0.0, -0.0, 1.5, -24.0, nan))
-
-
-def test_levels_are_the_quantizers() -> None:
-    for which, code in levels():
-        quantizer, function = EVERY[which], compiled(which)
+@settings(max_examples=400)
+@given(st.integers(0, len(FIXED) - 1) | quantizers, st.data())
+def test_codes_of_consecutive_values_and_levels_are_the_quantizer_s(
+    drawn: int | Quantizer, data: st.DataObject
+) -> None:
+    quantizer = FIXED[drawn] if isinstance(drawn, int) else drawn
+    function = of_constants(drawn) if isinstance(drawn, int) else of_numbers(type(quantizer))
+    if not isinstance(drawn, int):
+        function.inputs["parameters"][:] = memoryview(array("d", numbers(quantizer)))
+    quantizer.reset()
+    held = nan
+    for y in data.draw(st.lists(values(quantizer), min_size=1, max_size=30)):
+        function.inputs["y"][0], function.inputs["held"][0] = y, held
+        function()
+        held, before = function.outputs["encoded"][0], quantizer.saturated
+        assert same(held, float(quantizer.encode(y)))
+        assert function.outputs["saturates"][0] == quantizer.saturated - before
+    top = quantizer.top if isinstance(quantizer, CodedQuantizer) else 0
+    codes = st.floats() if not top else st.integers(-top - 1, top) | st.integers(-2, 1)
+    for code in data.draw(st.lists(codes, max_size=20)):
         function.inputs["code"][0] = code
         function()
-        known = quantizer.decode(int(code) if isinstance(quantizer, CodedQuantizer) else code)
-        assert same(function.outputs["level"][0], known), (quantizer.__dict__, code)
+        assert same(function.outputs["level"][0], quantizer.level(code))
 
 
 def test_what_is_built_as_written_keeps_its_order_and_the_switch_returns() -> None:

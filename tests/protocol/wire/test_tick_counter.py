@@ -71,38 +71,29 @@ def test_an_hour_with_a_clock_that_runs_off_by_a_hundredth_loses_no_tick(rate: f
 def test_how_late_a_frame_is_counts_from_the_fastest_ones() -> None:
     start, late = 10**15, 3_000_000
     ticks = TickCounter(PERIOD_NS, 256, lockstep=False)
+    assert not ticks.known
     assert ticks.late_ns(0, start) == 0
     for tick in range(100):
-        assert ticks.advance(tick, start + tick * PERIOD_NS) == tick
-        assert ticks.late_ns(tick, start + tick * PERIOD_NS) == 0
+        at_ns = start + tick * PERIOD_NS
+        assert ticks.advance(tick, at_ns) == tick
+        assert (ticks.late_ns(tick, at_ns), ticks.due_ns(tick), ticks.tick_at(at_ns)) == (0, at_ns, tick)
     at_ns = start + 100 * PERIOD_NS + late
     assert ticks.advance(100, at_ns) == 100
     assert late - PERIOD_NS // TickCounter.DRIFT <= ticks.late_ns(100, at_ns) <= late
     assert ticks.advance(101, start + 101 * PERIOD_NS) == 101  # one late frame moves the mark by no more than that
     assert ticks.late_ns(101, start + 101 * PERIOD_NS) == 0
-
-
-def test_a_first_frame_that_was_held_up_misleads_nothing() -> None:
-    ticks = TickCounter(PERIOD_NS, 16, lockstep=False)
-    assert ticks.advance(0, 3 * PERIOD_NS) == 0
-    assert [ticks.advance(k % 16, k * PERIOD_NS) for k in range(3, 100)] == list(range(3, 100))
+    assert ticks.advance(101, start + 101 * PERIOD_NS + 100) is None  # not newer
 
 
 def test_a_frame_held_up_for_too_long_is_judged_wrongly_alone() -> None:
     ticks = TickCounter(PERIOD_NS, 16, lockstep=False)
-    for k in range(10):
-        ticks.advance(k, k * PERIOD_NS)
+    assert ticks.advance(0, 3 * PERIOD_NS) == 0  # a first frame that was held up misleads nothing
+    for k in range(3, 10):
+        assert ticks.advance(k, k * PERIOD_NS) == k
     assert ticks.advance(10, (10 + 14) * PERIOD_NS) == 26  # sixteen too many
     # The plant goes on where its grid is; what would step back is passed over until the grid is past the error.
     found = [ticks.advance(k % 16, k * PERIOD_NS) for k in range(25, 40)]
     assert found == [None, None, *range(27, 40)]
-
-
-def test_what_is_not_newer_has_no_tick() -> None:
-    ticks = TickCounter(PERIOD_NS, 256, lockstep=False)
-    assert [ticks.advance(k, k * PERIOD_NS) for k in (0, 1, 2)] == [0, 1, 2]
-    assert ticks.advance(2, 2 * PERIOD_NS + 100) is None
-    assert ticks.advance(1, 2 * PERIOD_NS + 200) is None
 
 
 def test_in_lockstep_a_counter_is_unwrapped_without_time() -> None:

@@ -55,7 +55,7 @@ class Composed:
             self.refused += 1
             return None
         no_command = self.wire.command.pack(read[0], [quantizer.invalid for quantizer in self.encoders])
-        levels = [quantizer.decode(code) for quantizer, code in zip(self.decoders, read[1], strict=True)]
+        levels = [quantizer.level(code) for quantizer, code in zip(self.decoders, read[1], strict=True)]
         if any(map(isnan, levels)):
             self.invalid += 1
             return no_command

@@ -9,12 +9,10 @@ from typing import Any, cast
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.intake import STATUS
-from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
+from aeroloop.protocol.messages.models import STATUS_VALUES, Grant, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Gains, Hold
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon import claim
 from aeroloop.service.daemon.claim import ClaimClient
 
@@ -93,7 +91,16 @@ def _bytes(payload: bytes) -> SimpleNamespace:
         (None, True, "none"),
         (b"\xff", True, "none"),
         (
-            b'{"state": "idle", "process": "p", "datagrams": "udp/h:1", "notes": [' + b"0," * STATUS + b"0]}",
+            Status(
+                role="plant",
+                state="idle",
+                uptime_s=0,
+                ticks=0,
+                rate_hz=0,
+                skipped=0,
+                datagrams="udp/h:1",
+                notes=[""] * STATUS_VALUES,
+            ).encode(),
             True,
             "none",
         ),

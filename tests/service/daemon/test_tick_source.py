@@ -12,9 +12,8 @@ import pytest
 
 from aeroloop.protocol.messages.trace import Received
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 from aeroloop.service.daemon.tick_source import MAILBOX, PlantTick, TickSource
 from tests.support.simulated_link import LOOP, PERIOD_NS, SimulatedLink, wire_of
 
@@ -100,7 +99,7 @@ def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later() -> No
         0: frame(0), 7: frame(7, 1), 22: frame(22, 1), 37: frame(37, 1)
     }  # fmt: skip
     assert all(each.missed == 0 for each in ticks)
-    assert all((each.received_as is Received.SILENT) == (each.frame == SILENCE) == (not each.fresh) for each in ticks)
+    assert all((each.received_as is Received.SILENT) == (each.frame == UNCHANGED) == (not each.fresh) for each in ticks)
     assert all(each.due_ns == source.when(each.tick) for each in ticks)
 
 
@@ -138,8 +137,8 @@ def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held() -> None:
     ticks = source.run(until(10))[5:]
     assert [(each.tick, each.frame, in_passing(each), each.missed) for each in ticks] == [
         (5, frame(5, 9), True, 0),
-        (9, SILENCE, False, 4),
-        (10, SILENCE, False, 0),
+        (9, UNCHANGED, False, 4),
+        (10, UNCHANGED, False, 0),
     ]
 
 
@@ -178,7 +177,7 @@ def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(drift: float, ji
     assert not any(in_passing(each) or each.missed for each in ticks)
 
 
-@pytest.mark.parametrize("nonsense", [SILENCE, b"\0", frame(5) + b"\0"], ids=["empty", "short", "long"])
+@pytest.mark.parametrize("nonsense", [UNCHANGED, b"\0", frame(5) + b"\0"], ids=["empty", "short", "long"])
 def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes) -> None:
     source = Source([arrival(0), *(arrival(k, content=nonsense) for k in range(1, 9))])
     ticks = source.run(until(8))
@@ -192,7 +191,7 @@ def test_a_frame_that_nonsense_follows_at_once_keeps_its_levels() -> None:
     both = [arrival(5, 9, late_ns=HALF_NS - 10), arrival(5, late_ns=HALF_NS - 10, content=b"\0")]
     source = Source([arrival(0), *both])
     ticks = source.run(until(6))
-    assert [each.frame for each in ticks if each.tick >= 4] == [SILENCE, frame(5, 9), b"\0", SILENCE, SILENCE]
+    assert [each.frame for each in ticks if each.tick >= 4] == [UNCHANGED, frame(5, 9), b"\0", UNCHANGED, UNCHANGED]
     assert source.ticks == list(range(7))
 
 
@@ -205,7 +204,7 @@ def test_a_frame_that_comes_twice_is_one_tick() -> None:
 
 
 def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None:
-    contents = [frame(0), *[SILENCE] * 14, frame(15), *[SILENCE] * 3]
+    contents = [frame(0), *[UNCHANGED] * 14, frame(15), *[UNCHANGED] * 3]
     arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
     source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
     ticks = source.run(7 * PERIOD_NS * 18)
@@ -213,7 +212,7 @@ def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None
 
 
 def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost() -> None:
-    contents = [frame(0), *[SILENCE] * 14, *[SILENCE] * 14, frame(30)]  # the frame of tick 15 is not there
+    contents = [frame(0), *[UNCHANGED] * 14, *[UNCHANGED] * 14, frame(30)]  # the frame of tick 15 is not there
     arrivals = [Arrival(content, PERIOD_NS * i) for i, content in enumerate(contents)]
     source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
     source.run(PERIOD_NS * 30)

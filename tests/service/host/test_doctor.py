@@ -13,7 +13,7 @@ import pytest
 from aeroloop.protocol.runtime.timing import TickGrid
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, SecuritySettings
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host import doctor
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority

@@ -12,8 +12,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.cli.main import execute
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 

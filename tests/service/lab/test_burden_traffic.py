@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.burden import POLICIES, codes_of, observe, traffic
 from aeroloop.service.lab.experiment import run_experiment, sent_ticks
@@ -61,7 +61,7 @@ def test_nothing_and_nonsense_are_refused() -> None:
     with pytest.raises(ValueError, match="ticks"):
         traffic(np.empty((0, 2)), KIND, np.arange(0), PERIOD)
     with pytest.raises(ValueError, match="malformed"):
-        codes_of([KIND.pack(0, (1, 2)), SILENCE], KIND)
+        codes_of([KIND.pack(0, (1, 2)), UNCHANGED], KIND)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
     for i, (kind, measured) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
         sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat).tolist()
-        assert [k for k, frames in enumerate(received) if frames[i] != SILENCE] == sent
+        assert [k for k, frames in enumerate(received) if frames[i] != UNCHANGED] == sent
         assert [received[k][i] for k in sent] == [said[k][i] for k in sent]
         reckoned = seen.traffic["on_change"][i]
         assert (reckoned.frames_per_s, reckoned.bits_per_s) == (measured.frames_per_s, measured.bits_per_s)

@@ -15,7 +15,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.figures import Figures, Floats
 from aeroloop.service.lab import c_code, experiment, loop_function
@@ -112,7 +112,7 @@ def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = T
     )
     for (codes, kind, policy), sent in zip(directions, zip(*frames, strict=True), strict=True):
         due = set(sent_ticks(codes, policy, heartbeat).tolist())
-        assert [frame if k in due else SILENCE for k, frame in enumerate(frames_of(codes, kind))] == list(sent)
+        assert [frame if k in due else UNCHANGED for k, frame in enumerate(frames_of(codes, kind))] == list(sent)
     found = experiment.experiment(settings, ticks * settings.loop.period)
     assert found.figures == figures
     assert found.course is not None

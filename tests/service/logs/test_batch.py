@@ -15,10 +15,9 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Reference, Sinusoid, Stream
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import CodedQuantizer, Quantizer
+from aeroloop.protocol.wire.quantizer import CodedQuantizer, LogarithmicQuantizer, Quantizer
 from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.figures import Score
@@ -149,7 +148,7 @@ class Run:
             computed.append(np.hstack(block))
             for k, row, due in zip(self.k[start:end].tolist(), commands.codes.tolist(), commands.sent, strict=True):
                 codes = row if self.wire.voltage.bits is None else [int(code) for code in row]
-                sent.append(self.wire.command.pack(k % 16, codes) if due else SILENCE)
+                sent.append(self.wire.command.pack(k % 16, codes) if due else UNCHANGED)
             after.append(controller.state)
         return after, np.vstack(computed), sent
 
@@ -201,7 +200,7 @@ def test_where_the_law_gives_no_number_no_valid_value_is_commanded() -> None:
     assert np.isnan(columns[100:, 17:20]).all()
     np.testing.assert_array_equal(columns, computed)
     assert commands == sent
-    assert sent[150:].count(SILENCE) > 100
+    assert sent[150:].count(UNCHANGED) > 100
     assert run.loop(states[150], 150)[2] == sent[150:]  # NaN goes through JSON, too, and is no change of levels
 
 

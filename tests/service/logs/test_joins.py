@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from aeroloop.protocol.messages.trace import RECORD_S, Outcome, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.messages.trace import RECORD_S, ControllerRow, Outcome, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
@@ -255,7 +255,7 @@ def missing_of(kept: Collection[int]) -> list[str]:
     for session, ticks in (("s1", 100), ("s2", 50), ("s3", 100)):
         writer.session = session
         for k in range(ticks):
-            writer.controller_row(k, Received.SILENT, Sent.FRAME, 10**10 + k, 10**10 + k, *frames)
+            writer.row(ControllerRow(k, Received.SILENT, Sent.FRAME, 10**10 + k, 10**10 + k, *frames))
             if k % 25 == 24:
                 batches.append(writer.take(10**10 + k, k, final=k == ticks - 1))
     for i in kept:

@@ -76,7 +76,7 @@ def strangers() -> list[Said]:
     """All of it on every topic of every daemon, at three instants; and well-formed messages of another vehicle."""
     found = []
     for topic in topics.TOPICS.values():
-        if topic.carries == "frame":  # which a log only has as evidence beside the traces
+        if topic.kind == "frame":  # which a log only has as evidence beside the traces
             continue
         for role in ("plant", "controller", "recorder") if "{role}" in topic.key else ("plant",):
             key = topics.key(topic.name, VEHICLE, session=SESSION, role=role)

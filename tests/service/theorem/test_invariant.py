@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import R, S, Vector
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings, Equations, equations
 from aeroloop.service.control.reference import Angles, Floats, Plan

@@ -97,7 +97,7 @@ def bare(spec: SignalSpec) -> bool:
 
 def assert_means(signal: Signal, spec: SignalSpec, code: float, decoded: Any) -> None:
     """What cantools decoded is what this code is to the quantizer."""
-    value = quantizer_of(spec).decode(code)
+    value = quantizer_of(spec).level(code)
     if spec.bits is None:
         assert signal.is_float
         assert repr(decoded) == repr(value)  # repr: NaN equals itself, and −0 is not 0

@@ -62,7 +62,7 @@ def test_fields_that_are_numbers_have_a_unit_in_their_names_or_count_something()
             assert field["type"] in ("string", "boolean") or name.endswith(units) or name in plain, name
 
 
-@pytest.mark.parametrize("name", [topic.name for topic in topics.TOPICS.values() if topic.carries == "json"])
+@pytest.mark.parametrize("name", [topic.name for topic in topics.TOPICS.values() if topic.kind == "json"])
 def test_messages_of_the_network_can_be_described_so_that_viewers_read_them(name: str) -> None:
     model = topics.TOPICS[name].model
     assert model is not None

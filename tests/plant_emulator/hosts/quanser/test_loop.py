@@ -13,7 +13,7 @@ from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.config import Settings, with_bits
 from aeroloop.service.control.controller import Controller
 from tests.support.plant_end import claim_of
@@ -66,7 +66,7 @@ def test_an_owner_that_ticks_by_what_has_passed_stays_in_the_boards_time() -> No
         assert frame is not None
         read = wire.measurement.unpack(frame)
         assert read is not None
-        assert not isnan(wire.attitude.quantizer().decode(read[1][0]))
+        assert not isnan(wire.attitude.quantizer().level(read[1][0]))
         assert board.time == k + plant.passed - 1
 
 
