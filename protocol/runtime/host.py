@@ -1,4 +1,4 @@
-"""Host: facts and package versions that make a log interpretable a year later, names of processes, who listens."""
+"""Host: facts and package versions that make a log interpretable a year later; names of processes and listeners."""
 
 from __future__ import annotations
 

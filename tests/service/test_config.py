@@ -26,7 +26,10 @@ from tests.support.made_log import make_log
 
 KEYS = keys(Settings)
 LEAVES = [key for key in KEYS if not any(other.startswith(f"{key}.") for other in KEYS)]
-KINDS = {"reference": (Sinusoid, Hold, Points, Stream, PointsFile), "law": tuple(MODELS.values())}
+KINDS: dict[str, tuple[Any, ...]] = {
+    "reference": (Sinusoid, Hold, Points, Stream, PointsFile),
+    "law": tuple(MODELS.values()),
+}
 
 ODD = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=80), st.just("file"),

@@ -279,8 +279,19 @@ class PlantEnd(RuleBasedStateMachine):
         assert claims.operator_only == self.stopped
 
 
-TestEndpoint = type("OfEndpoint", (PlantEnd,), {"make": EndpointEnd}).TestCase
-TestRelay = type("OfRelay", (PlantEnd,), {"make": RelayEnd}).TestCase
+class OfEndpoint(PlantEnd):
+    """The plant endpoint."""
+
+    make = EndpointEnd
+
+
+class OfRelay(PlantEnd):
+    """The relay between network and CAN bus."""
+
+    make = RelayEnd
+
+
+TestEndpoint, TestRelay = OfEndpoint.TestCase, OfRelay.TestCase
 TestEndpoint.settings = TestRelay.settings = settings(max_examples=120, stateful_step_count=40)
 
 

@@ -40,12 +40,18 @@ def end(request: pytest.FixtureRequest) -> VehicleClaim:
     return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
 
 
+def lost_and_stopped(end: VehicleClaim) -> None:
+    """A later stop replaces how it ended."""
+    end.lost("a")
+    end.stop()
+
+
 ENDINGS: list[tuple[Callable[[VehicleClaim], object], TripCause | str]] = [
     (lambda end: end.release("of-a"), "released"),
     (lambda end: end.lost("a"), TripCause.HOLDER_GONE),
     (lambda end: end.expire(TripCause.NO_ANSWER, "no answer"), TripCause.NO_ANSWER),
     (lambda end: end.stop(), TripCause.OPERATOR),
-    (lambda end: (end.lost("a"), end.stop()), TripCause.OPERATOR),  # a later stop replaces how it ended
+    (lost_and_stopped, TripCause.OPERATOR),
 ]
 
 

@@ -223,7 +223,7 @@ def test_it_stops_with_the_reason_where_it_cannot_follow() -> None:
     with_rows = [i for i, batch in enumerate(batches) if batch.header.rows]
     second, other = with_rows[1], batches[0]._replace(header=batches[0].header._replace(run=1))
     wider = WireSpec().with_bits(10, 10)
-    stops = (
+    stops: tuple[tuple[WireSpec, list[Batch], int, str], ...] = (
         (wire, batches[:second] + batches[second + 1 :], 256, "256 rows are missing after row 255 of the plant"),
         (wire, batches[second:], 0, "the log lacks the plant's first row, so the plant's state is not known"),
         (wire, batches[with_rows[0] :], 0, "tick 1 is in a session whose claim is missing"),

@@ -284,5 +284,6 @@ def test_wind_is_a_torque_about_the_axes() -> None:
 
 def test_the_ideal_plant_has_no_piece_whatever_is_set_and_a_free_one_keeps_its_own_body() -> None:
     assert _driven(_with(GUSTY, ideal=True, aero=WEIGHTLESS)) == _driven(_with(aero=IDEAL_AERO))
-    free = {"kind": "rigid_body", "rigid_body": RigidBodySettings(inertia=(0.01, 0.02, 0.03), rate=(1.0, 2.0, 3.0))}
-    assert _driven(_with(GUSTY, ideal=True, **free)) == _driven(_with(**free))
+    body = RigidBodySettings(inertia=(0.01, 0.02, 0.03), rate=(1.0, 2.0, 3.0))
+    ideal = _with(GUSTY, ideal=True, kind="rigid_body", rigid_body=body)
+    assert _driven(ideal) == _driven(_with(kind="rigid_body", rigid_body=body))

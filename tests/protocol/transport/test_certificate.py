@@ -32,7 +32,7 @@ def test_a_common_name_says_role_and_vehicle_and_is_no_domain(role: str, vehicle
 
 
 @pytest.mark.parametrize("text", ["", "pilot", "plant", "plant/", "/aero", "plant.aero", "operator/"])
-def test_any_other_common_name_is_none_of_a_role(text: str | None) -> None:
+def test_any_other_common_name_is_none_of_a_role(text: str) -> None:
     assert read_common_name(text) is None
 
 
