@@ -314,6 +314,18 @@ def test_a_counter_that_is_short_by_configuration_detects_no_such_stream(
     assert acted(end(watchdog=50, armed=True), delay=COUNTERS)
 
 
+@pytest.mark.parametrize("end", ENDS)
+def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive(
+    end: Callable[..., EndpointEnd | RelayEnd],
+) -> None:
+    it = end(armed=True)
+    it.tick(None, 5)
+    assert isinstance(it.claims.claim(claim_of(wire=WIRE)), Grant)
+    it.tick(None, 1)  # the measurement with counter 0, the only one that there is to answer
+    it.tick(WIRE.command.pack(5, (31, 31)), 1)
+    assert it.claims.state is PlantState.GRANTED
+
+
 def acted(it: EndpointEnd | RelayEnd, delay: int) -> bool:
     """Whether any command of a stream acts that answers every measurement so many ticks late."""
     assert isinstance(it.claims.claim(claim_of(wire=WIRE)), Grant)
