@@ -322,7 +322,7 @@ def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive(
     it.tick(None, 5)
     assert isinstance(it.claims.claim(claim_of(wire=WIRE)), Grant)
     it.tick(None, 1)  # the measurement with counter 0, the only one that there is to answer
-    it.tick(WIRE.command.pack(5, (31, 31)), 1)
+    it.tick(WIRE.command.pack(COUNTERS - 2, (31, 31)), 1)  # by its echo 2 ticks old
     assert it.claims.state is PlantState.GRANTED
 
 
