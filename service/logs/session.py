@@ -216,7 +216,7 @@ class TraceIndex:
     def chosen(
         self, which: SessionKey, end: End, ticks: tuple[float, float]
     ) -> dict[Source, tuple[list[BatchKey], int]]:
-        """A session's batches with rows of some ticks, in order, and how many rows; of the controller the known ones."""
+        """A session's batches with rows of some ticks, in order, and their rows; of the controller those known."""
         found = {}
         for source, table in self._tables.items():
             if (source.vehicle, source.end) == (which[0], end):
@@ -380,11 +380,9 @@ class TableBuilder:
         if header.first_row != self._next_row and batch.tail.state is not None:
             self.states[begin] = batch.tail.state
         rows = self._table[begin:end]
-        for name in names:
-            if name == "received" or name == "sent":
-                rows[name] = batch.times_ns(name)
-            elif name != "wall":
-                rows[name] = batch.columns[name]
+        for name in set(names) - {"received", "sent", "wall"}:
+            rows[name] = batch.columns[name]
+        rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
         rows["wall"] = header.wall_ns - header.monotonic_ns
         if "answered" in names:
             rows["answered"][rows["answered"] == NEVER] = NO_TICK

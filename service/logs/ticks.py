@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import Received, Sent
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import CodedQuantizer
-from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
@@ -188,7 +188,8 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     check_memory(_BYTES_PER_TICK * len(k), len(k))
     columns, over = _computed(session, progress)
     state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = columns
-    held, volts = _commanded(session), np.full((len(k), wire.actuators), nan)
+    held, _ = commanded(session, wire, controller["sent_as"], controller["command"])
+    volts = np.full((len(k), wire.actuators), nan)
     answers = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT)
     volts[answers] = held[at[answers]]
     del held
@@ -326,22 +327,23 @@ def _gains(session: Session) -> Array:
     return np.asarray(flat[which])
 
 
-def _commanded(session: Session) -> Array:
-    """Voltages of the command in force at each of the controller's rows; NaN before the first [V]."""
-    rows, wire = session.controller, session.settings.wire
-    framed = np.flatnonzero(rows["sent_as"] == Sent.FRAME)
-    volts = np.full((len(rows), wire.actuators), nan)
-    volts[framed] = levels(wire.voltage, codes_in(wire.command, rows["command"][framed]))
-    known = np.zeros(len(rows), dtype=np.int64)
-    known[framed] = framed
-    first = framed[0] if len(framed) else len(rows)
-    volts = volts[np.maximum.accumulate(known)]
-    volts[:first] = nan
-    for i, state in session.states.items():  # a silent command repeats one of before the gap
-        if (sent := state.get("sent_codes")) is not None and i < len(rows):
-            until = np.searchsorted(framed, i)
-            volts[i : framed[until] if until < len(framed) else None] = levels(wire.voltage, np.array(sent, np.float64))
-    return volts
+def commanded(
+    session: Session, wire: WireSpec, sent_as: npt.NDArray[np.uint8], frames: npt.NDArray[np.void]
+) -> tuple[Array, Flags]:
+    """Voltages of the command in force at each of the controller's rows [V], and where one is known. Shapes (n, …).
+
+    NaN is also a command without a valid value. A silent command repeats the last frame, or one of before a gap.
+    """
+    framed = sent_as == Sent.FRAME
+    last = np.maximum.accumulate(np.where(framed, np.arange(len(framed)), -1))
+    volts = levels(wire.voltage, codes_in(wire.command, frames))[last]
+    known = last >= 0
+    for i, state in session.states.items():
+        if (sent := state.get("sent_codes")) is not None:
+            until = i + int(np.argmax(np.append(framed[i:], True)))
+            volts[i:until], known[i:until] = levels(wire.voltage, np.array(sent, np.float64)), True
+    volts[~known] = nan
+    return volts, known
 
 
 # ── Frames ──
