@@ -203,7 +203,7 @@ class TraceIndex:
 
     def sources(self, end: End) -> list[Source]:
         """Processes of an end, in the order of recording."""
-        return [source for source in self._tables if source.end == end]
+        return [source for source, table in self._tables.items() if source.end == end and len(table)]
 
     def rows(self, source: Source) -> int:
         """Recorded rows of a process."""
