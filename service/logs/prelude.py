@@ -13,7 +13,6 @@ from typing import Any
 
 from mcap.records import Channel, Message, Metadata
 
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
@@ -24,12 +23,10 @@ from aeroloop.service.logs.mcap_file import (
     Damage,
     NotMcapError,
     records,
-    skim,
 )
+from aeroloop.service.logs.recording import ReviewError
 
-
-class ReviewError(AeroloopError):
-    """A log cannot be reviewed; one line with the reason."""
+__all__ = ["Prelude", "ReviewError", "address_of", "read_description"]
 
 
 class Prelude:
@@ -53,7 +50,7 @@ class Prelude:
         descriptions: dict[int, Address] = {}
         described: list[tuple[int, bytes, Address]] = []
         try:
-            for record in skim(path, _is_description) or records(path, self.damages):
+            for record in records(path, self.damages):
                 if isinstance(record, Message):
                     self.begins_ns = self.begins_ns or record.log_time
                     if address := descriptions.get(record.channel_id):
@@ -135,7 +132,3 @@ def address_of(key: str, topic: str) -> Address | None:
     """Address of a key if it is of this topic."""
     address = topics.read_key(key)
     return address if address is not None and address.topic.name == topic else None
-
-
-def _is_description(key: str) -> bool:
-    return address_of(key, "description") is not None

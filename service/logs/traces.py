@@ -10,6 +10,7 @@ import struct
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Final, Literal, NamedTuple
 from zlib import crc32
 
@@ -177,7 +178,11 @@ class TraceIndex:
         batches = self.sources.setdefault(source, Batches())
         number = self._names.setdefault(header.session, len(self._names))
         last = batches.add(header, payload, number)
-        self._in_force.setdefault((source, number), InForce()).add(header, payload, last)
+        text = payload[len(payload) - header.tail_bytes :]
+        if b'"changes"' in text or b'"record"' in text:
+            with suppress(ValidationError):
+                tail = Tail.model_validate_json(text)
+                self._in_force.setdefault((source, number), InForce()).add(header, tail, last)
         return header
 
     def finish(self) -> None:
@@ -224,7 +229,7 @@ class TraceIndex:
         in_force = InForce()
         for source, batches in self.sources.items():
             if source.vehicle == which[0] and (batches.column("session") == number).any():
-                in_force.update(self._in_force[source, number])
+                in_force.update(self._in_force.get((source, number), InForce()))
         self.changes[which] = in_force.changes()
         recorded = min(extent.first[end] for end in ENDS if extent.rows[end]), max(extent.last["controller"], proof)
         for first, last in in_force.unknown(segments, recorded):

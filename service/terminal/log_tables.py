@@ -312,6 +312,9 @@ def replay_table(replay: Replay) -> None:
                 f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
                 f"logged, {other.computed} computed"
             )
+    for end_name, lines in replay.details.items():
+        for line in lines:
+            console.print(f"{end_name}: {line}", markup=False, soft_wrap=True)
     ends: dict[End, EndReplay | None] = {"controller": replay.controller, "plant": replay.plant}
     for name, end in ends.items():
         if end is None:
