@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from aeroloop.service.logs.files import Progress
+from aeroloop.service.logs.recording import Progress
 from aeroloop.service.review.panels import MAX_POINTS
 from aeroloop.service.review.report import Findings, Report, differences
 from aeroloop.service.review.requirements import Limit

@@ -21,9 +21,8 @@ from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, 
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
-from aeroloop.service.logs.session import Session
+from aeroloop.service.logs.session import NO_TICK, Array, Integers, Session, SessionKey
 from aeroloop.service.logs.table import is_of_tick
-from aeroloop.service.logs.traces import NO_TICK, Array, Integers, SessionKey
 from aeroloop.service.review.report import FaultInterval, Mark
 
 MAX_MARKS: Final = 300

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.logs.session import Session
+from aeroloop.service.logs.session import Array, Integers, Session
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.report import Gap, Spread
 
 LONGEST_GAPS: Final = 100
@@ -42,7 +41,7 @@ def spread(nanoseconds: Array) -> Spread:
 
 
 def periods_ns(ticks: Ticks) -> Array:
-    """Time since the last measurement that was sent before each; NaN of the first, and of those not sent. Shape (n,)."""
+    """Time since the measurement sent before each; NaN of the first, and of those that were not sent. Shape (n,)."""
     periods, sent = np.full(len(ticks.k), np.nan), np.flatnonzero(ticks.sent_ns >= 0)
     periods[sent[1:]] = np.diff(ticks.sent_ns[sent])
     return periods
@@ -88,7 +87,10 @@ def lapses(session: Session, missed: Integers) -> dict[str, int]:
     for gap in session.missing:
         if gap.end == "controller" and gap.rows:
             missed = missed[(missed < gap.first_tick) | (missed > (inf if gap.last_tick is None else gap.last_tick))]
-    received_as, outcome = session.controller["received_as"], session.plant["outcome"]
+    first, last = session.k[[0, -1]] if len(session.k) else (0, -1)
+    ticks = np.maximum.accumulate(session.controller["tick"])  # a late row is of a lower one
+    received_as = session.controller["received_as"][(ticks >= first) & (ticks <= last)]
+    outcome = session.plant["outcome"][session.at_plant[session.at_plant >= 0]]
     found = {
         "late": np.isin(received_as, [Received.LATE]),
         "malformed": np.isin(received_as, [Received.MALFORMED]),

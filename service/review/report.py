@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.traces import Array, Missing
+from aeroloop.service.logs.session import Array, Missing
 
 
 class Spread(BaseModel, frozen=True):
@@ -124,7 +124,7 @@ class TheoremFindings(BaseModel, frozen=True):
     )
     pointwise_share: float | None = Field(
         default=None,
-        description="largest true ‖z‖ as a share of the bound that holds once ‖z‖ has been so small; it never exceeds 1",
+        description="largest true ‖z‖ as a share of the bound that holds once it was so small; it never exceeds 1",
     )
     pointwise_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
     pointwise_judged: int = Field(default=0, description="true states that judged it")

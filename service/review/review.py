@@ -17,8 +17,7 @@ from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError
 from aeroloop.service.figures import Figures, figures
-from aeroloop.service.logs.files import Progress, ReviewError
-from aeroloop.service.logs.recording import Recording
+from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Session
 from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
 from aeroloop.service.review.events import Messages, age_us, fault_intervals, happened, read_messages
@@ -106,7 +105,15 @@ def read(
         its = recording.session(which, since_s, until_s)
     except ConfigError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    judged, messages = recompute(its), read_messages(recording, which, its.settings.wire.actuators)
+    part = None if (since_s, until_s) == (-inf, inf) else (since_s, until_s)
+    if part is not None and not len(its.k):
+        until, lasts = (
+            "" if until_s == inf else f" and before {until_s:g} s",
+            its.extent.ticks * its.settings.loop.period,
+        )
+        raise ReviewError(f"nothing to review after {max(0.0, since_s):g} s{until}: the session has {lasts:g} s")
+    judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
+    messages = read_messages(recording, which, its.settings.wire.actuators)
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}
     for name, values in recording.metadata.items():
         facts.setdefault(name, {}).update(values)
@@ -116,7 +123,6 @@ def read(
     first = paths[0].resolve()
     name = first.name if first.is_dir() else first.stem
     name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    part = None if (since_s, until_s) == (-inf, inf) else (since_s, until_s)
     return Review(*_judge(recording, its, judged, messages, session is not None), its, judged.ticks, name, facts, part)
 
 

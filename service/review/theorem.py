@@ -24,8 +24,8 @@ import numpy.typing as npt
 from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
