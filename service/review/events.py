@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter, defaultdict
-from math import inf
+from collections.abc import Sequence
+from math import ceil, inf
 from operator import itemgetter
 from typing import Final, NamedTuple
 
@@ -202,6 +203,18 @@ def described(change: Change) -> str:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")
     return "; ".join(parts)
+
+
+def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
+    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
+    since, begun = 0, set[str]()
+    for change in changes:
+        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
+        if change.start is None and begun == {"gains", "reference"}:
+            return since, change.tick
+        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
+        since = max(since, change.tick + ceil(change.within_s / period))
+    return since, inf
 
 
 class _Placed(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.session import Array, Integers, Session
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.ticks import Codes, Ticks
 from aeroloop.service.review.report import Gap, Spread
 
 LONGEST_GAPS: Final = 100
@@ -56,7 +56,7 @@ def gaps(answered: Integers, period: float) -> tuple[int, list[Gap]]:
     return len(at), [Gap(time_s=round(k * period, 9), tick=k, ticks=ticks) for k, ticks in found]
 
 
-def saturation(wire: WireSpec, measurements: Array, commands: Array) -> tuple[dict[str, float], dict[str, int]]:
+def saturation(wire: WireSpec, measurements: Codes, commands: Codes) -> tuple[dict[str, float], dict[str, int]]:
     """Share of each signal's values at its outermost level, and how many frames have a component without a valid value.
 
     Args:

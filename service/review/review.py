@@ -161,7 +161,7 @@ def _judge(
         (judged.answered, judged.voltages),
         watchdog_s=settings.plant.watchdog_s,
         unsent=judged.unsent,
-        latency=latency and Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))),
+        latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         log=recording.name,
         trips=happening.trips,
         reasons={name: why for name, why in whys.items() if why and name in Figures.model_fields},

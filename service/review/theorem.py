@@ -15,8 +15,8 @@ tick is of the largest ‖z^Q‖ since the command that acts was computed; k, an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from math import ceil, hypot, inf, nan, sqrt
-from typing import Any, Final, NamedTuple
+from math import inf, nan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,27 +26,17 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.events import Truths
+from aeroloop.service.review.events import Truths, judged_ticks
 from aeroloop.service.review.observations import error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
+from aeroloop.service.theorem import lemma
 from aeroloop.service.theorem.any_law import Promise, promise
 from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.invariant import distance, reach
-from aeroloop.service.theorem.lemma import (
-    Inequality,
-    Samples,
-    coordinates,
-    lemma_inequalities,
-    lyapunov,
-    norm,
-    rotation,
-    times,
-)  # fmt: skip
+from aeroloop.service.theorem.lemma import norm
 from aeroloop.service.theorem.mean_square import decay
 
 Flags = npt.NDArray[np.bool_]
-
-PREMISES: Final = ("C.28", "C.29", "C.30", "Assumption 3")
 
 
 class TheoremCheck(NamedTuple):
@@ -80,39 +70,42 @@ def check_theorem(
     promised = promise(settings, begun, described)
     law, certificate, e, verdict = promised
     since, until = judged_ticks([*in_force(begun), *(one for one in changes if one.tick > begin)], period)
-    settled = since + transient_s(law) / period
+    settled = since + promised.transient_s / period
     z, V = _measured_norm(ticks, law)
     after = (ticks.k >= settled) & (ticks.k < until)
 
     _, place, its = np.intersect1d(ticks.k, truths.k, assume_unique=True, return_indices=True)
     at, q, omega = ticks.where(place), truths.attitude[its], truths.rate[its]
     sign, gain, estimate = _signals(at, law)
-    omega_d = times(rotation(at.attitude), at.desired_rate)
-    samples = Samples(of_nearer_sign(q, at.attitude), omega, at.attitude, at.rate, at.desired, omega_d, sign)
-    b = coordinates(samples.q, omega, at.desired, omega_d, sign, gain)
+    omega_d = lemma.times(lemma.rotation(at.attitude), at.desired_rate)
+    samples = lemma.Samples(of_nearer_sign(q, at.attitude), omega, at.attitude, at.rate, at.desired, omega_d, sign)
+    b = lemma.coordinates(samples.q, omega, at.desired, omega_d, sign, gain)
     theta = None if e is None else e.bounds.theta
     theta_error = np.zeros((1, 3)) if theta is None else theta - estimate
-    true_V = b.norm if law is None else lyapunov(b, theta_error, law)
+    true_V = b.norm if law is None else lemma.lyapunov(b, theta_error, law)
     true = np.vstack([b.norm, true_V, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
     within = (at.k >= since) & (at.k < until)
     true_after = within & (at.k >= settled)
 
     checks, outside, judged, run = list[LemmaCheck](), dict[str, int](), 0, dict[str, Any]()
-    why = _unjudged(promised, faults)
+    why = "faults acted at the plant" if faults and e is not None else promised.unjudged
     undecided = None
     if law is not None and e is not None and within.any():
-        sides = {one.equation: one for one in lemma_inequalities(samples, law, e.known, e.lemma)}
-        small = true[2] <= np.degrees(2 * e.known.half_angle_e) * (1 + 1e-9)
+        sides = {one.equation: one for one in lemma.lemma_inequalities(samples, law, e.known, e.lemma)}
         acts = np.clip(ticks.voltages, -settings.plant.voltage_limit, settings.plant.voltage_limit)
         error = norm(acts - ticks.unquantized[:, -acts.shape[1] :])
         refused = ~(error <= e.plant.delta_u * (1 + 1e-9) + 1e-12)  # NaN: no command
-        unmet = [sides.pop("C.28").broken, sides.pop("C.29").broken, refused[place], ~small]
-        outside = {name: int((within & where).sum()) for name, where in zip(PREMISES, unmet, strict=True)}
-        met = within & ~np.any(unmet, axis=0)
-        checks, judged = [_lemma_check(one, met, at.k * period) for one in sides.values()], int(met.sum())
+        large = true[2] > np.degrees(2 * e.known.half_angle_e) * (1 + 1e-9)
+        unmet = {name: sides.pop(name).broken for name in ("C.28", "C.29")}
+        unmet |= {"C.30": refused[place], "Assumption 3": large}
+        outside = {name: int((within & where).sum()) for name, where in unmet.items()}
+        met = within & ~np.any(list(unmet.values()), axis=0)
+        time: Array = np.asarray(at.k * period)
+        checks, judged = [_lemma_check(one, met, time) for one in sides.values()], int(met.sum())
         if why is None:
-            seen, good = np.where(ticks.k >= since, z, 0.0), within & small & ~refused[place]
-            x = distance(e.plant, b, sign, theta_error, times(np.swapaxes(rotation(at.desired), 1, 2), omega_d))
+            seen, good = np.where(ticks.k >= since, z, 0.0), within & ~large & ~refused[place]
+            own_rate = lemma.times(np.swapaxes(lemma.rotation(at.desired), 1, 2), omega_d)
+            x = distance(e.plant, b, sign, theta_error, own_rate)
             run, undecided = _guaranteed(settings, e, ticks.k, refused, seen, place, samples, good, true, x)
     broken = sum(one.broken for one in checks) if judged else None
     shares = [run[name] for name in ("mean_square_share", "pointwise_share") if name in run]
@@ -124,13 +117,13 @@ def check_theorem(
         pointwise_radius=radius,
         pointwise_deg=certificate.plant_deg if certificate is not None and radius is not None else None,
         **run,
-        transient_s=transient_s(law),
+        transient_s=promised.transient_s,
         since_s=round(since * period, 9),
         until_s=None if until == inf else round(until * period, 9),
-        z_norm=_largest(z[after]) if law is not None else None,
-        error_deg=_largest(error_deg(ticks.attitude_error[after])),
-        true_z_norm=_largest(true[0, true_after]) if law is not None else None,
-        true_error_deg=_largest(true[2, true_after]),
+        z_norm=float(z[after].max()) if law is not None and after.any() else None,
+        error_deg=float(error_deg(ticks.attitude_error[after]).max()) if after.any() else None,
+        true_z_norm=float(true[0, true_after].max()) if law is not None and true_after.any() else None,
+        true_error_deg=float(true[2, true_after].max()) if true_after.any() else None,
         damping_known=theta is not None,
         samples=int(within.sum()),
         outside=outside,
@@ -144,14 +137,15 @@ def check_theorem(
 
 def _guaranteed(
     settings: Settings, e: Evaluated, k: Integers, refused: Flags, seen: Array, place: Integers,
-    samples: Samples, good: Flags, true: Array, x: Array,
+    samples: lemma.Samples, good: Flags, true: Array, x: Array,
 ) -> tuple[dict[str, Any], str | None]:  # fmt: skip
     """Findings on the mean square and the invariant set; or none, and why.
 
     `k`, whether the command is `refused`, and ‖z^Q‖ as `seen` are of all ticks; the rest is of true states, at `place`.
     """
     period, late, (z, V) = settings.loop.period, 0 if settings.loop.lockstep else 1, true[:2]
-    time, apart = k[place] * period, np.diff(k[place]) * period
+    time: Array = np.asarray(k[place] * period)
+    apart = np.diff(k[place]) * period
     most_apart = period + (1.5 / settings.plant.truth_rate_hz if settings.plant.truth_rate_hz else 0.0)
 
     def decays(norms: Array) -> Array:
@@ -182,8 +176,8 @@ def _guaranteed(
         starts = np.append(inf, np.maximum(x[a : b - 1], x[a + 1 : b])) if late else x[a:b]
         start[a:b] = np.minimum.accumulate(starts)
     last, bound = np.flatnonzero(joined)[-1], np.full(len(apart), inf)
-    if e.plant_reach is not None:
-        bound[joined] = _by_size(start[joined], 4, lambda size: _radius(e, size))
+    if e.plant_reach is not None and (near := joined & (start < inf)).any():
+        bound[near] = _by_size(start[near], 4, lambda size: at.radius if (at := reach(e.plant, size)) else inf)
     found = {
         "radius": sqrt(grown[last] / apart[last] / rate[last + 1]),
         "spacing_s": float(apart[joined].max()),
@@ -201,11 +195,6 @@ def _by_size(sizes: Array, per_octave: int, of: Callable[[float], float | Sequen
     return np.array([of(2.0 ** (step / per_octave)) for step in steps.tolist()])[where].T
 
 
-def _radius(e: Evaluated, start: float) -> float:
-    at = reach(e.plant, start) if start < inf else None
-    return inf if at is None else at.radius
-
-
 def _closest(statement: str, left: Array, right: Array, time: Array) -> dict[str, Any]:
     """How many states judged a statement, the largest left-hand side as a share of the right one, and when."""
     share = np.divide(left, right, out=np.where(left > 0, inf, 0.0), where=right > 0)
@@ -213,9 +202,9 @@ def _closest(statement: str, left: Array, right: Array, time: Array) -> dict[str
     return dict(zip(names, (len(left), float(share[most]), round(float(time[most]), 9)), strict=True))
 
 
-def _lemma_check(one: Inequality, judged: Flags, time: Array) -> LemmaCheck:
+def _lemma_check(one: lemma.Inequality, judged: Flags, time: Array) -> LemmaCheck:
     """One inequality at the true states that are judged, with their times [s]. Shapes (n,)."""
-    left, right, broken, time = (column[judged] for column in (one.left, one.right, one.broken, time))
+    left, right, time, broken = one.left[judged], one.right[judged], time[judged], one.broken[judged]
     found = LemmaCheck(equation=one.equation, what=one.what, samples=len(left), broken=int(broken.sum()))
     if not len(left):
         return found
@@ -225,16 +214,6 @@ def _lemma_check(one: Inequality, judged: Flags, time: Array) -> LemmaCheck:
     return found.model_copy(update=closest)
 
 
-def _unjudged(promised: Promise, faults: bool) -> str | None:
-    """Why neither mean square nor invariant set can be judged; None if they can."""
-    if (e := promised.bounds) is None:
-        return promised.verdict.rstrip(".")
-    if faults or e.bounds.unproven:
-        return "faults acted at the plant" if faults else "; ".join(e.bounds.unproven)
-    large = hypot(*(e.bounds.theta or ())) > e.plant.k_theta
-    return f"the plant's ‖θ‖ exceeds law.damping_bound = {e.plant.k_theta:g}" if large else None
-
-
 def _reasons(found: TheoremFindings, promised: Promise, why: str | None, undecided: str | None) -> dict[str, str]:
     """Why each finding that is null is so, by its name; `why`, and where the mean square is `undecided`, if known."""
     verdict, no_truth = found.verdict.rstrip("."), "the log has no true state of a tick that is judged"
@@ -242,7 +221,7 @@ def _reasons(found: TheoremFindings, promised: Promise, why: str | None, undecid
     short = f"the transient lasts {found.transient_s:.3g} s, and {end}"
     true = short if found.error_deg is None and found.samples else no_truth
     e, another = promised.bounds, verdict if promised.law is None else None
-    lemma = verdict if e is None else "no true state satisfies the lemma's premises" if found.samples else no_truth
+    unmet = verdict if e is None else "no true state satisfies the lemma's premises" if found.samples else no_truth
     far = "no true state is near enough to the invariant set" if found.samples else no_truth
     if e is not None and e.plant_reach is None:
         far = "no invariant set is proven of the configured plant"
@@ -251,33 +230,12 @@ def _reasons(found: TheoremFindings, promised: Promise, why: str | None, undecid
         ("z_norm",): another or short,
         ("true_error_deg",): true,
         ("true_z_norm",): another or true,
-        ("broken", "held"): lemma,
+        ("broken", "held"): unmet,
         ("radius", "mean_square_share", "mean_square_at_s", "spacing_s"): why or undecided or no_truth,
         ("pointwise_radius", "pointwise_deg"): verdict if found.holds is None else "the certificate does not hold",
         ("pointwise_share", "pointwise_at_s", "pointwise_since_s", "pointwise_bound"): why or far,
     }
     return {f"theorem.{name}": text for names, text in texts.items() for name in names if getattr(found, name) is None}
-
-
-def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
-    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
-    since, begun = 0, set[str]()
-    for change in changes:
-        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
-        if change.start is None and begun == {"gains", "reference"}:
-            return since, change.tick
-        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
-        since = max(since, change.tick + ceil(change.within_s / period))
-    return since, inf
-
-
-def transient_s(law: AdaptiveSettings | None) -> float:
-    """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, and z₂ by J⁻¹C₂ (C.22) [s].
-
-    After it an error has fallen to 5 %, but θ̃ may take much longer. Of another law, that of the paper's gains.
-    """
-    law = law or AdaptiveSettings()
-    return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 
 def _signals(ticks: Ticks, law: AdaptiveSettings | None) -> tuple[Array, Array, Array]:
@@ -287,8 +245,8 @@ def _signals(ticks: Ticks, law: AdaptiveSettings | None) -> tuple[Array, Array, 
     """
     if law is not None:
         return ticks.state_next[:, 3], ticks.gains[:, :3], ticks.state[:, :3]
-    unknown = np.full((len(ticks.k), 3), nan)
-    return np.where((ticks.attitude * ticks.desired).sum(axis=1) < 0, -1.0, 1.0), unknown, unknown
+    nearer = np.where((ticks.attitude * ticks.desired).sum(axis=1) < 0, -1.0, 1.0)
+    return nearer, *np.full((2, len(ticks.k), 3), nan)
 
 
 def _measured_norm(ticks: Ticks, law: AdaptiveSettings | None) -> tuple[Array, Array]:
@@ -298,7 +256,3 @@ def _measured_norm(ticks: Ticks, law: AdaptiveSettings | None) -> tuple[Array, A
     z1 = (1 - sign * eta_e) ** 2 + (ticks.attitude_error**2).sum(axis=1)  # (C.39), its square
     z2 = (ticks.rate_error + sign[:, None] * gain * ticks.attitude_error) ** 2  # (C.40); G z₁ = ±ε̃ by (C.49)
     return np.sqrt(z1 + z2.sum(axis=1)), z1 + z2 @ np.array((law or AdaptiveSettings()).inertia) / 2
-
-
-def _largest(values: Array) -> float | None:
-    return float(values.max()) if len(values) else None

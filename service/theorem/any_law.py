@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from math import hypot
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -69,6 +70,24 @@ class Promise(NamedTuple):
     certificate: Certificate | None
     bounds: Evaluated | None
     verdict: str
+
+    @property
+    def unjudged(self) -> str | None:
+        """Why no run can be judged by the bounds; None if they are proven of the configured plant."""
+        if (e := self.bounds) is None:
+            return self.verdict.rstrip(".")
+        large = hypot(*(e.bounds.theta or ())) > e.plant.k_theta
+        too_large = f"the plant's ‖θ‖ exceeds law.damping_bound = {e.plant.k_theta:g}"
+        return "; ".join(e.bounds.unproven) or (too_large if large else None)
+
+    @property
+    def transient_s(self) -> float:
+        """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, z₂ by J⁻¹C₂ (C.22) [s].
+
+        After it an error has fallen to 5 %, but θ̃ may take much longer. Of another law, that of the paper's gains.
+        """
+        law = self.law or AdaptiveSettings()
+        return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 
 def promise(settings: Sections, changes: Sequence[Change] = (), described: Mapping[str, Any] | None = None) -> Promise:
