@@ -110,4 +110,4 @@ def read_run(*paths: Path | str, session: str | None = None, vehicle: str | None
         AeroloopError: Not a log, several unrelated runs, or no such session.
     """
     read = review.read(*map(Path, paths), session=session, vehicle=vehicle)
-    return RecordedRun(read.session.settings, read.figures, read.ticks)
+    return RecordedRun(read.settings, read.figures, read.ticks)

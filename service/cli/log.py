@@ -87,7 +87,7 @@ def review(
             from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(report, judged.session.settings, folder)
+                drawn = draw_figures(report, judged.settings, folder)
             names = ", ".join(dict.fromkeys(path.stem for path in drawn))
             typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:

@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, 
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
-from aeroloop.service.logs.session import NO_TICK, Array, Integers, Session, SessionKey
+from aeroloop.service.logs.session import Array, Integers, Session, SessionKey
 from aeroloop.service.logs.table import is_of_tick
 from aeroloop.service.review.report import FaultInterval, Mark
 
@@ -107,12 +107,14 @@ class Happened(NamedTuple):
     losses: dict[str, int]
 
 
-def happened(messages: Messages, session: Session, *, alone: bool = False) -> Happened:
-    """What happened to the vehicle of a session; if `alone`, without the trips of its other sessions."""
+def happened(messages: Messages, session: Session, span: tuple[int, int], alone: bool) -> Happened:
+    """What happened to the vehicle of a session; if `alone`, without the trips of its other sessions.
+
+    Marks outside of the `span` from the first to the last tick have no time.
+    """
     found: defaultdict[tuple[str, str], list[_Placed]] = defaultdict(list)
     trips, losses = list[str](), Counter[str]()
-    last, knots = max(session.extent.last.values(), default=NO_TICK), _knots(session)
-    period = session.settings.loop.period
+    (first, last), knots, period = span, _knots(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
@@ -120,7 +122,7 @@ def happened(messages: Messages, session: Session, *, alone: bool = False) -> Ha
                 continue  # the change itself is in the trace, with its tick
             if message.kind == "tripped" and role == "plant" and (of_session or not alone):
                 trips.append(message.text)
-            if of_session and message.tick is not None and 0 <= message.tick <= last + 1:
+            if of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
                 found[role, message.kind].append(_Placed(message.tick, message.text))
             else:
                 within = of_session and message.tick is None
@@ -138,8 +140,8 @@ def happened(messages: Messages, session: Session, *, alone: bool = False) -> Ha
         if rest:
             kept.append(rest[-1]._replace(text=f"{len(rest)} more, the last: {rest[-1].text}"))
         for tick, text, within in kept:
-            shown = min(max(tick, 0), last) if within else tick
-            outside = -1 if shown < 0 else 1 if shown > last + 1 else 0
+            shown = min(max(tick, first), last) if within else tick
+            outside = -1 if shown < first else 1 if shown > last + 1 else 0
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
     return Happened([mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses))

@@ -40,7 +40,7 @@ class Gap(BaseModel, frozen=True):
 class Mark(BaseModel, frozen=True):
     """An event on the time axis: an event message, a change of gains or reference, a loss."""
 
-    time_s: float | None = Field(description="on the law's clock [s]; null if outside the session")
+    time_s: float | None = Field(description="on the law's clock [s]; null if outside of what was read")
     kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
     role: str
     text: str

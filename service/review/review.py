@@ -15,10 +15,11 @@ from typing import Any, Final
 
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
-from aeroloop.service.config import ConfigError
+from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.figures import Figures, figures
+from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import Session
+from aeroloop.service.logs.session import Missing, Session
 from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
 from aeroloop.service.review.events import Messages, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
@@ -43,9 +44,9 @@ class Review:
     Attributes:
         figures: The figures of merit.
         findings: The findings, which have them, too.
-        theorem: What the theorem comes to.
-        session: The session's rows.
+        settings: The session's configuration.
         ticks: Its ticks that are judged.
+        theorem: What the theorem comes to.
         name: Name of the run: of its file or folder, without the ending.
         facts: Facts about software and host, by role.
         part: From when to when the session was read, on the law's clock; None if all of it was [s].
@@ -53,17 +54,16 @@ class Review:
 
     figures: Figures
     findings: Findings
-    theorem: TheoremCheck
-    session: Session
+    settings: Settings
     ticks: Ticks
+    theorem: TheoremCheck
     name: str
     facts: dict[str, dict[str, Any]]
-    part: tuple[float, float] | None = None
+    part: tuple[float, float] | None
 
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
-        settings = self.session.settings
-        time, panels, thinned = panels_of(settings, self.ticks, self.theorem, points)
+        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
         checks = [limit.check(self.findings, limits) for limit in limits]
         return Report(
             name=self.name,
@@ -71,7 +71,7 @@ class Review:
             time=time,
             panels=panels,
             thinned=thinned,
-            settings=settings.description(),
+            settings=self.settings.description(),
             facts=self.facts,
             part=self.part,
             bands=[Band(fault.begin_s, fault.end_s, fault.fault) for fault in self.findings.faults],
@@ -107,23 +107,21 @@ def read(
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
     part = None if (since_s, until_s) == (-inf, inf) else (since_s, until_s)
     if part is not None and not len(its.k):
-        until, lasts = (
-            "" if until_s == inf else f" and before {until_s:g} s",
-            its.extent.ticks * its.settings.loop.period,
-        )
-        raise ReviewError(f"nothing to review after {max(0.0, since_s):g} s{until}: the session has {lasts:g} s")
+        lasts = its.extent.ticks * its.settings.loop.period
+        raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     messages = read_messages(recording, which, its.settings.wire.actuators)
+    merits, findings, theorem = _judge(recording, its, judged, messages, part, alone=session is not None)
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}
-    for name, values in recording.metadata.items():
-        facts.setdefault(name, {}).update(values)
+    for kind, values in recording.metadata.items():
+        facts.setdefault(kind, {}).update(values)
     for _, role, status in messages.published:
         if isinstance(status, Status) and status.notes:
             facts.setdefault(role, {})["notes"] = status.notes
     first = paths[0].resolve()
     name = first.name if first.is_dir() else first.stem
     name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    return Review(*_judge(recording, its, judged, messages, session is not None), its, judged.ticks, name, facts, part)
+    return Review(merits, findings, its.settings, judged.ticks, theorem, name, facts, part)
 
 
 def review(*paths: Path) -> Figures:
@@ -137,23 +135,32 @@ def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progre
 
 
 def _judge(
-    recording: Recording, session: Session, judged: Recomputed, messages: Messages, alone: bool
+    recording: Recording,
+    session: Session,
+    judged: Recomputed,
+    messages: Messages,
+    part: tuple[float, float] | None,
+    *,
+    alone: bool,
 ) -> tuple[Figures, Findings, TheoremCheck]:
-    """Figures, findings and the theorem's lines; the trips are of this session if it is `alone`."""
-    (vehicle, name), settings, ticks = session.which, session.settings, judged.ticks
-    loop, offset = settings.loop, judged.offset_ns
+    """Figures, findings and the theorem's lines of a session; if `alone`, without the trips of others."""
+    (vehicle, name), settings, ticks, offset = session.which, session.settings, judged.ticks, judged.offset_ns
+    loop, faults = settings.loop, fault_intervals(messages, session)
+    first, last = (0, max(session.extent.last.values())) if part is None else session.k[[0, -1]].tolist()
+    happening = happened(messages, session, (first, last), alone)
     spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, session.which))
-    known = not loop.lockstep and not isnan(offset[0])
-    latency, lockstep = spreads.get("latency"), LOCKSTEP if loop.lockstep else None
-    whys = {
-        "latency_us": None if latency else lockstep or "no measurement was answered",
-        "age_us": None if age else lockstep or "the log has no status of the controller with an age",
-        "timing.period": None if "period" in spreads else lockstep or "fewer than two measurements",
-        "timing.latency": None if latency else lockstep or "no measurement was answered",
-        "clock_offset_us": None if known else lockstep or "too few ticks have all four times of sending and receiving",
+    known, latency = not loop.lockstep and not isnan(offset[0]), spreads.get("latency")
+    unanswered = None if latency else "no measurement was answered"
+    unavailable = {
+        "latency_us": unanswered,
+        "age_us": None if age else "the log has no status of the controller with an age",
+        "timing.period": None if "period" in spreads else "fewer than two measurements",
+        "timing.latency": unanswered,
+        "clock_offset_us": None if known else "too few ticks have all four times of sending and receiving",
     }
-    happening, faults = happened(messages, session, alone=alone), fault_intervals(messages, session)
-    malformed = [f"malformed: {count} of {topic}" for topic, count in sorted(messages.malformed.items())]
+    reasons = {key: LOCKSTEP if loop.lockstep else why for key, why in unavailable.items() if why}
+    if part is not None:
+        reasons["duration_s"] = f"of the session only what is {_in_words(part)} was read"
     merits = figures(
         settings.wire,
         loop.period,
@@ -164,24 +171,26 @@ def _judge(
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         log=recording.name,
         trips=happening.trips,
-        reasons={name: why for name, why in whys.items() if why and name in Figures.model_fields},
-        damages=[*recording.unread, *malformed],
+        reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
+        damages=[
+            *recording.unread,
+            *(f"malformed: {count} of {topic}" for topic, count in sorted(messages.malformed.items())),
+        ],
     )
     description = session.descriptions.get("controller")
     certificate = description.certificate if description else None
     theorem = check_theorem(settings, ticks, messages.truths, session.changes, certificate, faults=bool(faults))
-    missing = [gap for gap in recording.missing if gap.vehicle == vehicle]
-    unseen = [*(str(gap) for gap in session.missing if gap.rows), *map(str, session.unknown)]
     gap_count, longest = gaps(judged.answered, loop.period)
     saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
-    started = (
-        datetime.fromtimestamp(int(ticks.wall_ns[0]) * 1e-9, UTC).isoformat(timespec="milliseconds")
-        if len(ticks.k)
-        else ""
-    )
+    missing = [gap for gap in recording.missing if gap.vehicle == vehicle]
+    unseen: list[Missing | Unknown] = [*(gap for gap in session.missing if gap.rows), *session.unknown]
+    if part is not None:
+        since, until = part[0] / loop.period, part[1] / loop.period
+        unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
+    started_s = ticks.wall_ns[:1] * 1e-9
     findings = Findings(
-        **{name: getattr(merits, name) for name in Figures.model_fields if name != "reasons"},
-        reasons=merits.reasons | {name: why for name, why in whys.items() if why} | theorem.reasons,
+        **{key: getattr(merits, key) for key in Figures.model_fields if key != "reasons"},
+        reasons=merits.reasons | reasons | theorem.reasons,
         vehicle=vehicle,
         session=name,
         sessions=len(recording.sessions_of(vehicle)),
@@ -190,7 +199,7 @@ def _judge(
             for (owner, one), extent in recording.extents.items()
         ],
         disagreements=disagreements(session.descriptions),
-        started=started,
+        started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
         timing=spreads,
         clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if known else None,
         age_us=age,
@@ -199,16 +208,21 @@ def _judge(
         saturated=saturated,
         invalid=invalid,
         losses=happening.losses,
-        missing_ticks={end: sum(gap.rows for gap in missing if gap.end == end) for end in ENDS},
+        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
         missing=missing,
         unknown=session.unknown,
-        unseen={"missing_ticks": unseen, "damages": recording.damaged},
+        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
         lapses=lapses(session, judged.missed),
         theorem=theorem.findings,
         marks=happening.marks,
         faults=faults,
     )
     return merits, findings, theorem
+
+
+def _in_words(part: tuple[float, float]) -> str:
+    since, until = max(0.0, part[0]), part[1]
+    return f"from {since:g} s on" if until == inf else f"from {since:g} s to {until:g} s"
 
 
 def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
