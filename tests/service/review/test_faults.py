@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import random
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import FaultStatus, Status
@@ -14,14 +14,12 @@ from aeroloop.service import examples
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.demo import DemoFigures
-from aeroloop.service.logs.runs import Block
 from aeroloop.service.report.page.page import page
 from aeroloop.service.report.page.verdict import judgement
-from aeroloop.service.review.faults import FaultLog
 from aeroloop.service.review.report import Band, FaultInterval, Findings
 from aeroloop.service.review.review import read
-from tests.support.edited_log import Said, rewrite
-from tests.support.made_log import make_log
+from tests.support.edited_log import Said, edited, message_of, rewrite
+from tests.support.made_log import START_NS, make_log
 
 TICKS = 500
 CONFIGURED = ["command:drop=0.3@0.2..0.6", "rate:noise=0.001@0.8", "attitude:off@5"]
@@ -133,6 +131,18 @@ def test_the_demos_summary_names_them_before_its_figures(
 # ── several sessions and processes ──
 
 
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of 50 ticks without a status, which begins at the plant's tick 100."""
+
+    def later(columns: Any) -> None:
+        columns["tick"] += 100
+
+    folder = tmp_path_factory.mktemp("quiet")
+    make_log(folder / "plain.mcap", 50, settings=load())
+    return rewrite(folder / "plain.mcap", folder / "quiet.mcap", edited("plant", later))
+
+
 def status(session: str | None, uptime_s: float, changed: int, end_tick: int | None = None) -> Status:
     fault = FaultStatus(
         fault="command:drop=0.1", source="configured", begin_tick=10, end_tick=end_tick, changed=changed, effect="…"
@@ -149,35 +159,27 @@ def status(session: str | None, uptime_s: float, changed: int, end_tick: int | N
     )
 
 
-def statuses_in_some_order(statuses: tuple[Status, ...]) -> list[tuple[int, Status]]:
-    """Statuses with their times of publication, as a recorder writes them that recovers some of them late."""
-    published = list(enumerate(statuses))
-    random.Random(len(statuses)).shuffle(published)
-    return published
+def intervals(quiet: Path, out: Path, *statuses: Status) -> list[FaultInterval]:
+    """Faults of the session, whose plant published these statuses in this order; a recorder wrote them in another."""
+    said = [message_of("status", one, START_NS + i, role="plant") for i, one in enumerate(statuses)]
+    random.Random(len(said)).shuffle(said)
+    more = [one._replace(recorded_ns=START_NS + 10**9 + i) for i, one in enumerate(said)]
+    return read(rewrite(quiet, out, more=more)).findings.faults
 
 
-def intervals(*statuses: Status, first: int = 100, ticks: int = 50) -> list[FaultInterval]:
-    log = FaultLog("s", 0.1)
-    for at_ns, one in statuses_in_some_order(statuses):
-        log.status(one, at_ns)
-    k = np.arange(ticks)
-    log.take(Block(("aero", "s"), k, {}, {"tick": first + k, "session_tick": k}, k, k, k, [], None))
-    return log.intervals()
-
-
-def test_of_a_fault_that_acts_in_several_sessions_only_this_ones_frames_count() -> None:
-    (found,) = intervals(
-        status("r", 1, 3), status(None, 2, 5), status("s", 3, 6), status(None, 4, 9), status("t", 5, 20)
-    )
+def test_of_a_fault_that_acts_in_several_sessions_only_this_ones_frames_count(quiet: Path, tmp_path: Path) -> None:
+    statuses = status("r", 1, 3), status(None, 2, 5), status("s1", 3, 6), status(None, 4, 9), status("t", 5, 20)
+    (found,) = intervals(quiet, tmp_path / "a.mcap", *statuses)
     assert (found.begin_s, found.end_s, found.changed) == (0.0, None, 9 - 5)
 
 
-def test_what_another_process_of_the_plant_counted_before_is_not_subtracted() -> None:
-    (found,) = intervals(status(None, 100, 50), status("s", 3, 6), status(None, 0.5, 0))
+def test_what_another_process_of_the_plant_counted_before_is_not_subtracted(quiet: Path, tmp_path: Path) -> None:
+    statuses = status(None, 100, 50), status("s1", 3, 6), status(None, 0.5, 0)
+    (found,) = intervals(quiet, tmp_path / "a.mcap", *statuses)
     assert found.changed == 6
 
 
-def test_a_fault_that_was_over_before_the_session_is_not_listed() -> None:
-    assert intervals(status("s", 3, 6, end_tick=100)) == []
-    (found,) = intervals(status("s", 3, 6, end_tick=101))
-    assert found.end_s == pytest.approx(0.1)
+def test_a_fault_that_was_over_before_the_session_is_not_listed(quiet: Path, tmp_path: Path) -> None:
+    assert intervals(quiet, tmp_path / "a.mcap", status("s1", 3, 6, end_tick=100)) == []
+    (found,) = intervals(quiet, tmp_path / "b.mcap", status("s1", 3, 6, end_tick=101))
+    assert found.end_s == pytest.approx(0.002)

@@ -17,20 +17,11 @@ from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
 from aeroloop.service.review.report import Check, Findings, Mark, Spread
 from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.review import read, report, review
+from aeroloop.service.review.review import read, review
 from aeroloop.service.terminal.log_tables import sparkline
+from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, lockstep, make_log
-
-TICKS = 500
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of 500 ticks in real time, each answered after 300 µs."""
-    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    make_log(path, TICKS, settings=load())
-    return path
 
 
 def found(path: Path) -> Findings:
@@ -237,14 +228,14 @@ def test_findings_are_the_figures_and_more(whole: Path) -> None:
 def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
     facts = {"git": "abc", "cpu": "two cores"}
     path = rewrite(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
-    made = report([path], [Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
+    made = read(path).report([Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
     assert made.name == "night"
     assert made.settings["wire"]["voltage"]["bits"] == 6
     host = {"host": "h", "versions": {}}
     assert made.facts == {"controller": host, "plant": host, "recorder": facts}
     assert made.findings.checks == [
         Check(text="skipped ≤ 0", holds=True, found="0"),
-        Check(text="latency.p99 ≤ 100 µs", holds=False, found="297.9 µs"),
+        Check(text="latency.p99 ≤ 100 µs", holds=False, found="300 µs"),
     ]
 
 
@@ -312,7 +303,7 @@ def test_the_keys_of_the_json_are_stable_and_the_exit_code_reports_whether_limit
     assert execute(["log", "review", str(whole), "--json", "--require", "latency.p50=1"]) == 1
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"][0]["holds"] is False
-    assert output.err == "aeroloop: latency.p50 is 297.9, more than 1\n"
+    assert output.err == "aeroloop: latency.p50 is 300, more than 1\n"
 
 
 def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:
@@ -338,7 +329,7 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     assert execute(["log", "review", str(path), "--require", "gaps=0"]) == 1
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
-    assert "latency 298 298 298 300 µs" in out
+    assert "latency 300 300 300 300 µs" in out
     assert out.startswith("0.410 s plant tripped the [red] limit 0.500 s")
     assert "plant refused no 0 refused (and 14 more like it, the last: 0.500 s)" in out
     assert "… and 4 more such events" in out  # beside what the session began with
