@@ -193,18 +193,18 @@ class Recording:
         """
         settings, wanted = self.settings(which), dict[Source, list[BatchKey]]()
         first, last = since_s / settings.loop.period, until_s / settings.loop.period
-        until = {"controller": last, "plant": last + settings.loop.ticks(ANSWER_S)}  # when the last answer acts
         tables: dict[End, TableBuilder] = {}
         for end in ENDS:
-            found = self._index.chosen(which, end, (first, until[end]))
-            rows = sum(rows for _, rows in found.values())
-            check_memory(rows * table_dtype(end, settings.wire).itemsize, self.extents[which].ticks)
+            until = last + (settings.loop.ticks(ANSWER_S) if end == "plant" else 0)  # when the last answer acts
+            source, keys, rows = self._index.chosen(which, end, first, until)
+            check_memory(rows * table_dtype(end, settings.wire).itemsize, rows)
             tables[end] = TableBuilder(end, settings.wire, rows)
-            wanted |= {source: keys for source, (keys, _) in found.items()}
+            if source is not None:
+                wanted[source] = keys
         for source, batch in self.batches(wanted):
             tables[source.end].add(batch)
         self.malformed["trace"] += sum(table.malformed for table in tables.values())
-        unknown = self._index.unknown_ranges(which)
+        unknown = self._index.unknown_of(which)
         controller, plant = tables["controller"].table(), tables["plant"].table(unknown)
         k, at_controller, at_plant, acted = join(controller, plant, first, last)
         return Session(
@@ -227,8 +227,8 @@ class Recording:
     def plants(self) -> dict[Source, tuple[Description | None, int]]:
         """Processes of plants, with the description of each as it began, and its recorded rows."""
         return {
-            source: (self._described_at(source.vehicle, "plant", self._begun_ns[source]), self._index.rows(source))
-            for source in self._index.sources("plant")
+            source: (self._described_at(source.vehicle, "plant", self._begun_ns[source]), rows)
+            for source, rows in self._index.plants.items()
         }
 
     def batches(self, wanted: Mapping[Source, Sequence[BatchKey] | None]) -> Iterator[tuple[Source, Batch]]:

@@ -26,7 +26,7 @@ from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
 from aeroloop.service.logs.session import Array, Missing, Session, SessionKey, Source
-from aeroloop.service.logs.ticks import LoggedController, commanded, rows_of
+from aeroloop.service.logs.ticks import LoggedController, commanded, levels, rows_of
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -246,7 +246,7 @@ def _held_before(again: LoggedController, session: Session, first: int) -> list[
     state = again.controller.state
     law = "; ".join(f"{name} = {_numbers(values)}" for name, values in state.law.items())
     sent = state.sent_codes or state.voltage_codes
-    volts = "none" if sent is None else _numbers(map(again.controller.wire.voltage.quantizer().level, sent)) + " V"
+    volts = "none" if sent is None else _numbers(levels(again.controller.wire.voltage, np.array(sent))) + " V"
     lines = [f"the controller held q = {_numbers(state.attitude)}; {law}; command {volts}"]
     before = np.flatnonzero(session.plant["session_tick"] <= session.controller["tick"][first])
     if len(before):

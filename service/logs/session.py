@@ -7,6 +7,7 @@ a batch that was recorded twice, and `TraceIndex` knows every session's length b
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
@@ -141,6 +142,7 @@ class TraceIndex:
         missing: Missing rows.
         changes: Changes of gains and reference of each session, in order.
         unknown: Ticks whose gains, reference or law's state the log does not hold.
+        plants: Processes of plants, with their recorded rows.
         malformed: Batches that are malformed, or of no process of the session.
     """
 
@@ -149,11 +151,13 @@ class TraceIndex:
         self.missing: list[Missing] = []
         self.changes: dict[SessionKey, list[Change]] = {}
         self.unknown: list[Unknown] = []
+        self.plants: dict[Source, int] = {}
         self.malformed = 0
         self._names: dict[str, int] = {"": 0}
         self._values: dict[Source, array[int]] = {}
         self._tables: dict[Source, Table] = {}
-        self._in_force: dict[tuple[Source, int], InForce] = {}  # by process and session
+        self._parts: dict[tuple[SessionKey, End], tuple[Source, Table]] = {}  # the batches of a session's end
+        self._in_force: defaultdict[tuple[Source, str], InForce] = defaultdict(InForce)
 
     def add(self, vehicle: str, payload: bytes) -> tuple[Source, str] | None:
         """Add a batch; returns its process and session. A malformed one is dropped and counted."""
@@ -166,101 +170,90 @@ class TraceIndex:
         first, last, proof = _ticks(batch)
         values = self._values.setdefault(source, array("q"))
         values.extend((*key_of(header, payload), session, header.rows, header.final, first, last, proof))
-        self._in_force.setdefault((source, session), InForce()).add(header, batch.tail, last)
+        self._in_force[source, header.session].add(header, batch.tail, last)
         return source, header.session
 
     def finish(self) -> None:
         """Find sessions, and what the log lacks of them, once all batches are added."""
-        for source, values in self._values.items():
-            self._tables[source] = self._sorted(values)
-        self._keep_one_process_a_session()
+        self._sort_out()
         names = list(self._names)
-        proofs: dict[tuple[SessionKey, End], int] = {}
-        ended: set[tuple[SessionKey, End]] = set()
-        for (vehicle, end, _), table in self._tables.items():
-            other: End = "plant" if end == "controller" else "controller"
+        for source, table in self._tables.items():
             for number in dict.fromkeys(table["session"].tolist()):
-                which, its = (vehicle, names[number]), table[table["session"] == number]
+                its, which = table[table["session"] == number], (source.vehicle, names[number])
+                if number:
+                    self._parts[which, source.end] = source, its
                 if number and its["rows"].any():
                     extent = self.extents.setdefault(which, Extent(*(dict.fromkeys(ENDS, n) for n in (0, NO_TICK, 0))))
-                    extent.first[end] = int(its["first"][its["rows"] > 0].min())
-                    extent.last[end], extent.rows[end] = int(its["last"].max()), int(its["rows"].sum())
-                    proofs[which, other] = int(its["proof"].max())
-                if its["final"].any():
-                    ended.add((which, end))
-        for source, table in self._tables.items():
+                    extent.first[source.end] = int(its["first"][its["rows"] > 0].min())
+                    extent.last[source.end], extent.rows[source.end] = int(its["last"].max()), int(its["rows"].sum())
+            if source.end == "plant" and len(table):
+                self.plants[source] = int(table["rows"].sum())
             self._find_gaps(source, table, names)
         for which, extent in self.extents.items():
-            for end in ENDS:
-                proof = proofs.get((which, end), NO_TICK)
+            parts = {end: self._parts[which, end][1] for end in ENDS if (which, end) in self._parts}
+            proofs = {end: int(part["proof"].max()) for end, part in parts.items()}
+            for end, other in zip(ENDS, reversed(ENDS), strict=True):
+                proof = proofs.get(other, NO_TICK)
                 if any((m.vehicle, m.session, m.end, m.last_tick) == (*which, end, None) for m in self.missing):
                     continue
                 if proof > extent.last[end]:  # the other end proves rows after the last one
                     self._lacks(*which, end, extent.last[end] + 1, proof, proof - extent.last[end])
-                elif (which, end) not in ended:
+                elif end not in parts or not parts[end]["final"].any():
                     self._lacks(*which, end, extent.last[end] + 1, None, 0)
-            self._find_unknown(which, proofs.get((which, "controller"), NO_TICK))
-
-    def sources(self, end: End) -> list[Source]:
-        """Processes of an end, in the order of recording."""
-        return [source for source in self._tables if source.end == end]
-
-    def rows(self, source: Source) -> int:
-        """Recorded rows of a process."""
-        return int(self._tables[source]["rows"].sum())
+            self._find_unknown(which, max(extent.last["controller"], proofs.get("plant", NO_TICK)))
 
     def keys(self, source: Source) -> list[BatchKey]:
         """All batches of a process, in the order of its rows."""
         return _keys(self._tables[source])
 
     def chosen(
-        self, which: SessionKey, end: End, ticks: tuple[float, float]
-    ) -> dict[Source, tuple[list[BatchKey], int]]:
-        """A session's batches with rows of some ticks, in order, and their rows; of the controller those known."""
-        found = {}
-        for source, table in self._tables.items():
-            if (source.vehicle, source.end) == (which[0], end):
-                its = table[(table["session"] == self._names[which[1]]) & (table["rows"] > 0)]
-                its = its[(its["first"] <= ticks[1]) & (its["last"] >= ticks[0])]
-                if end == "controller":
-                    its = its[~_within(its["last"], self.unknown_ranges(which))]
-                if len(its):
-                    found[source] = _keys(its), int(its["rows"].sum())
-        return found
+        self, which: SessionKey, end: End, first: float, last: float
+    ) -> tuple[Source | None, list[BatchKey], int]:
+        """A session's batches with rows of some ticks: their process, keys in order, and rows; no unknown ones."""
+        if (which, end) not in self._parts:
+            return None, [], 0
+        source, its = self._parts[which, end]
+        its = its[(its["rows"] > 0) & (its["first"] <= last) & (its["last"] >= first)]
+        if end == "controller":
+            its = its[~within(its["last"], self.unknown_of(which))]
+        return source, _keys(its), int(its["rows"].sum())
 
-    def unknown_ranges(self, which: SessionKey) -> list[Range]:
+    def unknown_of(self, which: SessionKey) -> list[Range]:
         """Unknown ticks of a session."""
         return [(one.first_tick, one.last_tick) for one in self.unknown if (one.vehicle, one.session) == which]
 
-    def _sorted(self, values: array[int]) -> Table:
-        """The batches in order, without duplicates and overlapping ones, which no end publishes."""
-        rows = np.unique(np.array(values, dtype=np.int64).reshape(-1, len(_FIELDS)), axis=0)  # the key comes first
-        table: Table = rows.view(np.dtype([(name, np.int64) for name in _FIELDS])).ravel()
-        same = (np.diff(rows[:, :2], axis=0) == 0).all(axis=1) & (rows[1:, 1] == 1)
-        table = table[np.append(True, ~same)]
-        kept, after = [], 0
-        for i, (first, n) in enumerate(zip(table["first_row"].tolist(), table["rows"].tolist(), strict=True)):
-            if not n or first >= after:
-                kept.append(i)
-                after = max(after, first + n)
-        self.malformed += len(table) - len(kept)
-        return table[kept]
+    def _sort_out(self) -> None:
+        """Put batches in order, without duplicates and without those that no process of the session publishes.
 
-    def _keep_one_process_a_session(self) -> None:
-        """Drop batches of a session whose other batches, of the same end and more rows, are of another process.
-
-        Why: a process claims a session or grants it. Batches of its name and of another process are a stranger's.
+        Those overlap others; or more rows of the session, of the same end, are of another process: a process claims a
+        session or grants it, so batches of its name and of another process are a stranger's.
         """
-        rows: dict[tuple[str, End, int], dict[Source, int]] = {}
+        owners: dict[tuple[str, End, int], tuple[int, Source]] = {}
+        for source, values in self._values.items():
+            rows = np.unique(np.array(values, dtype=np.int64).reshape(-1, len(_FIELDS)), axis=0)  # by the key
+            same = (np.diff(rows[:, :2], axis=0) == 0).all(axis=1) & (rows[1:, 1] == 1)
+            table: Table = rows.view(np.dtype([(name, np.int64) for name in _FIELDS])).ravel()[np.append(True, ~same)]
+            strange, after = np.zeros(len(table), dtype=np.bool_), 0
+            for i, (first, n) in enumerate(zip(table["first_row"].tolist(), table["rows"].tolist(), strict=True)):
+                strange[i] = n and first < after
+                after = after if strange[i] else max(after, first + n)
+            table = self._without(table, strange)
+            self._tables[source] = table
+            for number in set(table["session"].tolist()):
+                which = source.vehicle, source.end, number
+                count = int(table["rows"][table["session"] == number].sum())
+                owners[which] = max(owners.get(which, (-1, source)), (count, source), key=lambda one: one[0])
         for source, table in self._tables.items():
-            for number in set(table["session"].tolist()) - {0}:
-                its = rows.setdefault((source.vehicle, source.end, number), {})
-                its[source] = int(table["rows"][table["session"] == number].sum())
-        for (*_, number), its in rows.items():
-            for source in its.keys() - {max(its, key=its.__getitem__)}:
-                strange = self._tables[source]["session"] == number
-                self._tables[source] = self._tables[source][~strange]
-                self.malformed += int(strange.sum())
+            foreign = [
+                number
+                for number in set(table["session"].tolist()) - {0}
+                if owners[source.vehicle, source.end, number][1] != source
+            ]
+            self._tables[source] = self._without(table, np.isin(table["session"], foreign))
+
+    def _without(self, table: Table, strange: npt.NDArray[np.bool_]) -> Table:
+        self.malformed += int(strange.sum())
+        return table[~strange]
 
     def _find_gaps(self, source: Source, table: Table, names: list[str]) -> None:
         having = table[table["rows"] > 0]
@@ -292,22 +285,21 @@ class TraceIndex:
         lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
         self.missing.append(lacks)
 
-    def _find_unknown(self, which: SessionKey, proof: int) -> None:
-        """Find a session's changes, and the ticks before the last answered one at which they are not known."""
-        extent, number = self.extents[which], self._names[which[1]]
+    def _find_unknown(self, which: SessionKey, last_tick: int) -> None:
+        """Find a session's changes, and the ticks up to the last answered one at which they are not known."""
         in_force, segments = InForce(), list[Segment]()
-        for source, table in self._tables.items():
-            its = table[table["session"] == number]
-            if source.vehicle != which[0] or not len(its):
-                continue
-            in_force.update(self._in_force[source, number])
-            having = its[its["rows"] > 0]
-            if source.end == "controller" and len(having):
-                breaks = np.flatnonzero(having["first_row"][1:] > (having["first_row"] + having["rows"])[:-1]) + 1
-                for part in np.split(having, breaks):
-                    segments.append(Segment(part["first"].tolist(), int(part["last"].max())))
+        for end in ENDS:
+            if (which, end) in self._parts:
+                source, its = self._parts[which, end]
+                in_force.update(self._in_force[source, which[1]])
+                having = its[its["rows"] > 0]
+                if end == "controller" and len(having):
+                    gaps = having["first_row"][1:] > (having["first_row"] + having["rows"])[:-1]
+                    for part in np.split(having, np.flatnonzero(gaps) + 1):
+                        segments.append(Segment(part["first"].tolist(), int(part["last"].max())))
         self.changes[which] = in_force.changes()
-        recorded = min(extent.first[end] for end in ENDS if extent.rows[end]), max(extent.last["controller"], proof)
+        extent = self.extents[which]
+        recorded = min(extent.first[end] for end in ENDS if extent.rows[end]), last_tick
         for first, last in in_force.unknown(segments, recorded):
             self.unknown.append(Unknown(vehicle=which[0], session=which[1], first_tick=first, last_tick=last))
 
@@ -345,7 +337,8 @@ def _ticks(batch: Batch) -> tuple[int, int, int]:
     return int(ticks[0]), last, NO_TICK if answered == NEVER else answered
 
 
-def _within(ticks: Integers, ranges: Sequence[Range]) -> npt.NDArray[np.bool_]:
+def within(ticks: Integers, ranges: Sequence[Range]) -> npt.NDArray[np.bool_]:
+    """Which ticks any of some ranges has."""
     found = np.zeros(len(ticks), dtype=np.bool_)
     for first, last in ranges:
         found |= (ticks >= first) & (ticks <= last)
@@ -391,7 +384,7 @@ class TableBuilder:
     def table(self, unknown: Sequence[Range] = ()) -> Table:
         """All rows, without those of the plant at unknown ticks."""
         table = self._table[: self._filled]
-        if "session_tick" in (table.dtype.names or ()) and (left_out := _within(table["session_tick"], unknown)).any():
+        if "session_tick" in (table.dtype.names or ()) and (left_out := within(table["session_tick"], unknown)).any():
             return table[~left_out]
         return table
 
@@ -409,8 +402,8 @@ def join(controller: Table, plant: Table, first: float = -inf, last: float = inf
     received_as = controller["received_as"]
     computed = np.flatnonzero((received_as == Received.FRAME) | (received_as == Received.SILENT))
     acting = np.flatnonzero((plant["outcome"] == Outcome.ACTED) & (plant["answered"] != NO_TICK))
-    k = np.union1d(controller["tick"][computed], plant["session_tick"])
-    k = k[(k >= first) & (k <= last)]
+    both = np.sort(np.concatenate([controller["tick"][computed], plant["session_tick"]]), kind="stable")
+    k = both[(np.diff(both, prepend=NO_TICK - 1) > 0) & (both >= first) & (both <= last)]
     return (
         k,
         _places(controller["tick"][computed], computed, k),

@@ -184,55 +184,33 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
         LawError, PluginError: As of `Controller`.
     """
     wire, k, controller, plant = session.settings.wire, session.k, session.controller, session.plant
-    at, at_plant, acted = session.at_controller, session.at_plant, session.acted
+    at, at_plant = session.at_controller, session.at_plant
     check_memory(_BYTES_PER_TICK * len(k), len(k))
+    wall, sent, latency, there, back, offset_ns = _timed(session)
+    volts = _voltages(session)
     columns, over = _computed(session, progress)
     state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = columns
-    held, _ = commanded(session, wire, controller["sent_as"], controller["command"])
-    volts = np.full((len(k), wire.actuators), nan)
-    answers = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT)
-    volts[answers] = held[at[answers]]
-    del held
-    others = (at < 0) & _is(plant, acted, "received_as", Sent.FRAME)  # on commands whose rows are missing
-    volts[others] = levels(wire.voltage, codes_in(wire.command, plant["command"][acted[others]]))
-
-    sent = _times(plant, at_plant, "sent", _is(plant, at_plant, "sent_as", Sent.FRAME))
-    acted_ns = _times(plant, acted, "received", _is(plant, acted, "received_as", Sent.FRAME))
-    received = _times(controller, at, "received", _is(controller, at, "received_as", Received.FRAME))
-    forward, backward = _since(sent, received), _since(_times(controller, at, "sent"), acted_ns)
-    offset = clock_offset(forward, backward)
-    known_offset = offset[~np.isnan(offset)]
-    wall = np.where(
-        at_plant >= 0,
-        _times(plant, at_plant, "sent") + _times(plant, at_plant, "wall"),
-        _times(controller, at, "received") + _times(controller, at, "wall"),
-    )
     ticks = Ticks(
-        k, wall, sent, _since(sent, acted_ns), forward - offset, backward + offset, attitude, desired, rate,
-        rate - rate_error, attitude_error, rate_error, volts, unquantized, _gains(session), state, after,
+        k, wall, sent, latency, there, back, attitude, desired, rate, rate - rate_error, attitude_error, rate_error,
+        volts, unquantized, _gains(session), state, after,
     )  # fmt: skip
-
-    answered = answers | (acted >= 0)
+    answered = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT) | (session.acted >= 0)
     until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
     valid = ~np.isnan(attitude[:until, 0])
-    framed = _is(plant, at_plant, "sent_as", Sent.FRAME)
-    framed |= (at_plant < 0) & _is(controller, at, "received_as", Received.FRAME)
+    by_plant = _is(plant, at_plant, "sent_as", Sent.FRAME)
+    by_controller = (at_plant < 0) & _is(controller, at, "received_as", Received.FRAME)
+    frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
+    silent = answered & _is(controller, at, "sent_as", Sent.SILENT)
     judged = ticks.where(slice(until))
-    its = framed & (at_plant >= 0)
-    frames = np.concatenate([plant["measurement"][at_plant[its]], controller["measurement"][at[framed & ~its]]])
-    commands = controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]]
     return Recomputed(
         ticks=judged if valid.all() else judged.where(valid),
         answered=k[answered],
         voltages=volts[answered],
         missed=k[:until][over[:until]],
-        unsent=(
-            int((valid & ~framed[:until]).sum()),
-            int((answered & _is(controller, at, "sent_as", Sent.SILENT)).sum()),
-        ),
+        unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int(silent.sum())),
         measurements=codes_in(wire.measurement, frames),
-        commands=codes_in(wire.command, commands),
-        offset_ns=(float(known_offset[0]), float(known_offset[-1])) if len(known_offset) else (nan, nan),
+        commands=codes_in(wire.command, controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]]),
+        offset_ns=offset_ns,
     )
 
 
@@ -327,6 +305,18 @@ def _gains(session: Session) -> Array:
     return np.asarray(flat[which])
 
 
+def _voltages(session: Session) -> Array:
+    """What was commanded at each tick [V]; NaN where nothing was. Shape (n, actuators)."""
+    at, acted, wire = session.at_controller, session.acted, session.settings.wire
+    volts = np.full((len(session.k), wire.actuators), nan)
+    held, _ = commanded(session, wire, session.controller["sent_as"], session.controller["command"])
+    answers = _is(session.controller, at, "sent_as", Sent.FRAME, Sent.SILENT)
+    volts[answers] = held[at[answers]]
+    others = (at < 0) & _is(session.plant, acted, "received_as", Sent.FRAME)  # the controller's rows are missing
+    volts[others] = levels(wire.voltage, codes_in(wire.command, session.plant["command"][acted[others]]))
+    return volts
+
+
 def commanded(
     session: Session, wire: WireSpec, sent_as: npt.NDArray[np.uint8], frames: npt.NDArray[np.void]
 ) -> tuple[Array, Flags]:
@@ -412,6 +402,24 @@ def clock_offset(forward: Array, backward: Array) -> Array:
             found[begin:end] = base + middle + slope * (np.arange(end - begin) - quick.mean())
             last_ns = float(found[end - 1])
     return found
+
+
+def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, tuple[float, float]]:
+    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`."""
+    rows, plant, at, at_plant = session.controller, session.plant, session.at_controller, session.at_plant
+    sent = _times(plant, at_plant, "sent", _is(plant, at_plant, "sent_as", Sent.FRAME))
+    acted = _times(plant, session.acted, "received", _is(plant, session.acted, "received_as", Sent.FRAME))
+    received = _times(rows, at, "received", _is(rows, at, "received_as", Received.FRAME))
+    forward, backward = _since(sent, received), _since(_times(rows, at, "sent"), acted)
+    offset = clock_offset(forward, backward)
+    known = offset[~np.isnan(offset)]
+    wall = np.where(
+        at_plant >= 0,
+        _times(plant, at_plant, "sent") + _times(plant, at_plant, "wall"),
+        _times(rows, at, "received") + _times(rows, at, "wall"),
+    )
+    ends = (float(known[0]), float(known[-1])) if len(known) else (nan, nan)
+    return wall, sent, _since(sent, acted), forward - offset, backward + offset, ends
 
 
 def _times(table: Table, at: Integers, name: str, known: Flags | None = None) -> Integers:
