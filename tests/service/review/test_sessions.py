@@ -186,27 +186,12 @@ def test_runs_differ_by_what_their_plants_were_and_not_by_addresses(tmp_path: Pa
     assert [one.key for one in Comparison.of(read_runs(runs)).differences] == ["plant.aero.mass"]
 
 
-def test_lockstep_has_no_durations_and_says_why(tmp_path: Path) -> None:
-    shown = report([write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))])
-    findings = shown.findings
-    assert (findings.latency_us, findings.timing, findings.age_us) == (None, {}, None)
-    for name in ("latency_us", "age_us", "timing.latency", "timing.period"):
-        assert "lockstep" in findings.reasons[name]
-    assert not {"latency", "period"} & {panel.group for panel in shown.panels}
+def test_in_lockstep_the_exported_durations_are_empty(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))
     export([tmp_path / "a.mcap"], "csv", tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row[name] for row in rows for name in ("latency_us", "measurement_delay_us", "command_delay_us")} == {""}
-
-
-def test_the_latency_is_that_of_the_session(tmp_path: Path) -> None:
-    """Not that of the plant's process since its start, as its status has it."""
-    findings = read(write(tmp_path / "a.mcap", load(), made(load(), 100))).findings
-    assert findings.latency_us is not None
-    assert (findings.latency_us.p50, findings.latency_us.count) == (
-        findings.timing["latency"].p50,
-        findings.timing["latency"].count,
-    )
 
 
 # What is said
