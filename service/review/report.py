@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.traces import Array, Missing
+from aeroloop.service.logs.session import Array, Missing
 
 
 class Spread(BaseModel, frozen=True):
@@ -40,7 +40,7 @@ class Gap(BaseModel, frozen=True):
 class Mark(BaseModel, frozen=True):
     """An event on the time axis: an event message, a change of gains or reference, a loss."""
 
-    time_s: float | None = Field(description="on the law's clock [s]; null if outside the session")
+    time_s: float | None = Field(description="on the law's clock [s]; null if outside of what was read")
     kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
     role: str
     text: str
@@ -88,9 +88,9 @@ class LemmaCheck(BaseModel, frozen=True):
     what: str = Field(description="its left-hand side, in the paper's letters")
     samples: int
     broken: int = Field(description="samples at which it does not hold")
-    closest: float | None = Field(description="largest left-hand side as a share of the bound")
-    closest_s: float | None = Field(description="when that was, on the law's clock [s]")
-    broken_s: float | None = Field(description="when it was first broken [s]; null where never")
+    closest: float | None = Field(default=None, description="largest left-hand side as a share of the bound")
+    closest_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    broken_s: float | None = Field(default=None, description="when it was first broken [s]; null where never")
 
 
 class TheoremFindings(BaseModel, frozen=True):
@@ -105,26 +105,31 @@ class TheoremFindings(BaseModel, frozen=True):
         description="whether the run kept to all that could be judged: Lemma 1, the mean square, the invariant set"
     )
     radius: float | None = Field(
+        default=None,
         description="√(δ_Q/k), the root of the mean of ‖z‖² in the long run, of the configured plant while ‖z‖ is as "
-        "at the run's end [1, rad/s]"
+        "at the run's end [1, rad/s]",
     )
     pointwise_radius: float | None = Field(
         description="bound of ‖z‖ at every instant, in the end [1, rad/s]; null where the certificate does not hold"
     )
     pointwise_deg: float | None = Field(description="the attitude error within that bound [deg]")
     mean_square_share: float | None = Field(
-        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1"
+        default=None,
+        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1",
     )
-    mean_square_at_s: float | None = Field(description="when that was, on the law's clock [s]")
-    mean_square_judged: int = Field(description="true states that judged it")
-    spacing_s: float | None = Field(description="longest time between two of them; the integral is by trapezoids [s]")
+    mean_square_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    mean_square_judged: int = Field(default=0, description="true states that judged it")
+    spacing_s: float | None = Field(
+        default=None, description="longest time between two of them; the integral is by trapezoids [s]"
+    )
     pointwise_share: float | None = Field(
-        description="largest true ‖z‖ as a share of the bound that holds once ‖z‖ has been so small; it never exceeds 1"
+        default=None,
+        description="largest true ‖z‖ as a share of the bound that holds once it was so small; it never exceeds 1",
     )
-    pointwise_at_s: float | None = Field(description="when that was, on the law's clock [s]")
-    pointwise_judged: int = Field(description="true states that judged it")
-    pointwise_since_s: float | None = Field(description="from when on, on the law's clock [s]")
-    pointwise_bound: float | None = Field(description="the least bound that judged [1, rad/s]")
+    pointwise_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    pointwise_judged: int = Field(default=0, description="true states that judged it")
+    pointwise_since_s: float | None = Field(default=None, description="from when on, on the law's clock [s]")
+    pointwise_bound: float | None = Field(default=None, description="the least bound that judged [1, rad/s]")
     transient_s: float = Field(description="how long the transient is taken to last [s]")
     since_s: float = Field(
         description="judged from then on, on the law's clock: a session that begins far from its reference first goes "

@@ -141,6 +141,8 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
         yield "", f"… and {more} more keys; --json has them all"
+    if (part := findings.reasons.get("duration_s")) is not None:
+        yield "part", part
     yield "session", f"{findings.session} of {findings.vehicle}, {_utc(findings.started)}"
     vehicles = dict.fromkeys(one.vehicle for one in findings.recorded)
     if len(vehicles) > 1:

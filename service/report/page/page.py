@@ -16,7 +16,7 @@ from typing import Final
 from aeroloop.service.report.page import setup, tables, theorem, verdict
 from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, period_s, spread_names
 from aeroloop.service.report.page.markup import Html, joined, tag
-from aeroloop.service.review.downsample import MAX_POINTS
+from aeroloop.service.review.panels import MAX_POINTS
 from aeroloop.service.review.report import Report
 
 SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")

@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -21,7 +20,6 @@ from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.figures import Score
 from aeroloop.service.logs.batch import BatchController, Commands, Computed
 from aeroloop.service.logs.codes import codes_in, encoded_by, frames_of, levels
 
@@ -277,25 +275,3 @@ def test_frames_are_read_and_written_many_at_once_as_each(
         assert bits(codes) == bits(rows)
     values = np.array(rows, dtype=np.float64).reshape(n, len(widths))
     assert [row.tobytes() for row in frames_of(kind, counters, values)] == frames
-
-
-@pytest.mark.parametrize("cut", [1, 7, 1000])
-def test_a_score_of_many_is_the_score_of_each_to_the_last_bit(cut: int) -> None:
-    """Over gaps longer than the watchdog holds a command, and with a command without a valid value."""
-    rng = np.random.default_rng(cut)
-    k = np.sort(rng.choice(3000, 1000, replace=False))
-    k[500:] += 400
-    errors, volts = rng.normal(scale=0.1, size=(1000, 3)), rng.normal(size=(1000, 2))
-    errors[700] = errors[300] = errors[np.abs(errors).sum(axis=1).argmax()] * 2  # the first of two largest stands
-    errors[700] *= -1
-    volts[123] = float("nan")
-    wire = load().wire
-    one, many = Score(wire, 0.002), Score(wire, 0.002)
-    for tick, error, voltages in zip(k.tolist(), errors.tolist(), volts.tolist(), strict=True):
-        one.error(tick, error)
-        one.command(tick, voltages)
-    for start in range(0, 1000, cut):
-        many.errors(k[start : start + cut], errors[start : start + cut])
-        many.commands(k[start : start + cut], volts[start : start + cut])
-    assert many.figures() == one.figures()
-    assert many._largest == one._largest

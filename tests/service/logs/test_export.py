@@ -25,7 +25,6 @@ from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.table import Rows, TruthColumns, columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.panels import columns_of as drawn_columns
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
@@ -318,7 +317,7 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
 
 
 @pytest.mark.parametrize(("actuators", "numbers"), [(1, "1"), (2, "23"), (3, "123"), (8, "12345678")])
-def test_the_table_and_the_review_have_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
+def test_the_table_has_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
     settings = load().model_copy(update={"wire": WireSpec(actuators=actuators)})
     one, volts, q = np.ones(1), np.ones((1, actuators)), np.ones((1, 4))
     law = q, q, q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
@@ -326,5 +325,3 @@ def test_the_table_and_the_review_have_a_column_for_each_motor_by_its_number(act
     rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts))
     names = {column.name for column in columns_of(rows, settings)}
     assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}
-    drawn = [column.label for column in drawn_columns(settings) if column.group == "input"]
-    assert drawn == [f"u{'₁₂₃₄₅₆₇₈'[int(i) - 1]}" for i in numbers]

@@ -46,9 +46,7 @@ def written(path: Path, known: Known, messages: list[Logged] | None = None) -> P
 
 
 def ticks_in(path: Path) -> Ticks:
-    blocks: list[Ticks] = []
-    read(path, watch=blocks.append)
-    return Ticks.joined(blocks)
+    return read(path).ticks
 
 
 @pytest.mark.parametrize("seed", SEEDS)
