@@ -40,15 +40,16 @@ Flags = npt.NDArray[np.bool_]
 
 
 class TheoremCheck(NamedTuple):
-    """Findings, why each that is null is so, and lines to draw: ‖z^Q‖, its V without θ̃ [N·m], and the true state.
+    """Findings, why each that is null is so, ‖z^Q‖ and its V without θ̃ [N·m] of the n ticks, and m true states.
 
-    Of that ‖z‖, V [N·m], error [deg] and q, interpolated, NaN before the first. Shapes (n,), (n,), (7, n).
+    Of these the ticks, and ‖z‖, V [N·m], error [deg] and q. Shapes (n,), (n,), (m,), (7, m).
     """
 
     findings: TheoremFindings
     reasons: dict[str, str]
     norm: Array
     V: Array
+    true_k: Integers
     true: Array
 
 
@@ -131,8 +132,7 @@ def check_theorem(
         lemma=checks,
         broken=broken,
     )
-    drawn = [np.interp(ticks.k, at.k, row, left=nan) for row in true] if len(place) else np.full((7, len(z)), nan)
-    return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, np.asarray(drawn))
+    return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, at.k, true)
 
 
 def _guaranteed(

@@ -381,10 +381,15 @@ def test_the_largest_norm_is_known_once_the_transient_after_the_approach_is_over
 
 
 def test_the_true_line_goes_from_one_published_state_to_the_next_and_begins_with_the_first() -> None:
-    found = trial(at_rest(range(40)), truths_at(10, 30, 90, rates=(0.01, 0.03, 0.09)))
-    assert np.isnan(found.true[0, :10]).all()
-    assert found.true[0, [10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
+    settings, ticks = load(overrides=["reference.kind=hold"]), at_rest(range(40))
+    found = check_theorem(settings, ticks, truths_at(10, 30, 90, rates=(0.01, 0.03, 0.09)))
     assert found.findings.samples == 2  # what lies between is drawn, not judged
+    lines = {
+        (panel.group, line.label): line.values for panel in panels_of(settings, ticks, found)[1] for line in panel.lines
+    }
+    norm = lines["z_norm", "true"]
+    assert np.isnan(norm[:10]).all()
+    assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
 
 
 def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
