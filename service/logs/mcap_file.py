@@ -243,7 +243,7 @@ class _Reader:
             self._file.seek(offset)
             head = self._file.read(_HEAD.size)
             opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            if opcode == Opcode.DATA_END and length == _CRC_BYTES and self._ends_in_magic():
+            if opcode == Opcode.DATA_END and length == _CRC_BYTES:
                 return
             wrong = ""
             if len(head) < _HEAD.size:
@@ -257,10 +257,6 @@ class _Reader:
                 return
             yield offset, opcode, head + self._file.read(length)
             offset += _HEAD.size + length
-
-    def _ends_in_magic(self) -> bool:
-        self._file.seek(self._size - len(MAGIC))
-        return self._file.read() == MAGIC
 
     def _index(self) -> list[McapRecord] | None:
         """The records of the index at the end; None if there is none, or it is damaged or not complete."""
@@ -294,22 +290,25 @@ class _Reader:
         for record in index:
             if isinstance(record, (Schema, Channel)):
                 record.write(builder)
-        places = {record.chunk_start_offset: Opcode.CHUNK for record in index if isinstance(record, ChunkIndex)}
-        places |= {record.offset: Opcode.METADATA for record in index if isinstance(record, MetadataIndex)}
-        places |= {record.offset: Opcode.ATTACHMENT for record in index if isinstance(record, AttachmentIndex)}
+        places: dict[int, tuple[int, int]] = {}  # kind and length of the record at an offset
+        for record in index:
+            if isinstance(record, ChunkIndex):
+                places[record.chunk_start_offset] = Opcode.CHUNK, record.chunk_length
+            elif isinstance(record, (MetadataIndex, AttachmentIndex)):
+                kind = Opcode.METADATA if isinstance(record, MetadataIndex) else Opcode.ATTACHMENT
+                places[record.offset] = kind, record.length
 
         def blocks() -> Iterator[tuple[int, int, bytes]]:
             after = 0
-            for offset, opcode in sorted(places.items()):
-                self._file.seek(offset)
-                head = self._file.read(_HEAD.size)
-                there, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-                end = offset + _HEAD.size + length
-                if there != opcode or length > MAX_RECORD or end > self._size or offset < after:
+            for offset, (opcode, size) in sorted(places.items()):
+                whole = after <= offset <= self._size - size and _HEAD.size <= size <= MAX_RECORD
+                self._file.seek(offset if whole else 0)
+                block = self._file.read(size) if whole else b""
+                if block[: _HEAD.size] != _HEAD.pack(opcode, max(0, size - _HEAD.size)):
                     self._damage(offset, "the record that the index has here is damaged")
                     continue
-                yield offset, opcode, head + self._file.read(length)
-                after = end
+                yield offset, opcode, block
+                after = offset + size
 
         return bytes(builder.end()), blocks()
 

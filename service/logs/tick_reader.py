@@ -130,7 +130,7 @@ class TickReader:
         attitude, desired, rate, attitude_error, rate_error, unquantized, gains, state, after = columns
         unquantized[over] = state[over] = np.nan
         ticks = Ticks(
-            block.k, *self._times(block), attitude, desired, rate, rate - rate_error, attitude_error, rate_error,
+            block.k, *self._times(block), attitude, desired, rate, attitude_error, rate_error,
             self._voltages(block, commanded), unquantized, gains, state, after,
         )  # fmt: skip
         sent = _is(plant, block.at_plant, "sent_as", Sent.FRAME)

@@ -32,7 +32,7 @@ from aeroloop.service.logs.recording import Progress, ReviewError, check_memory
 from aeroloop.service.logs.session import Array, Integers, Session, Table
 
 Flags = npt.NDArray[np.bool_]
-Codes = npt.NDArray[np.int32] | Array
+Codes = npt.NDArray[np.int16] | Array
 """Codes of frames: integers, or the doubles of a wire that is not quantized."""
 
 AT_A_TIME: Final = 8192
@@ -75,7 +75,6 @@ class Ticks(NamedTuple):
     attitude: Array
     desired: Array
     rate: Array
-    desired_rate: Array
     attitude_error: Array
     rate_error: Array
     voltages: Array
@@ -83,6 +82,11 @@ class Ticks(NamedTuple):
     gains: Array
     state: Array
     state_next: Array
+
+    @property
+    def desired_rate(self) -> Array:
+        """ω_d in the body frame [rad/s]. Shape (n, 3)."""
+        return self.rate - self.rate_error
 
     @classmethod
     def joined(cls, blocks: Collection[Self]) -> Self:
@@ -191,7 +195,7 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     columns, over = _computed(session, progress)
     state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = columns
     ticks = Ticks(
-        k, wall, sent, latency, there, back, attitude, desired, rate, rate - rate_error, attitude_error, rate_error,
+        k, wall, sent, latency, there, back, attitude, desired, rate, attitude_error, rate_error,
         volts, unquantized, _gains(session), state, after,
     )  # fmt: skip
     answered = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT) | (session.acted >= 0)
@@ -345,7 +349,7 @@ def codes_in(kind: FrameFormat, frames: npt.NDArray[np.void]) -> Codes:
     # A code starts within a byte and spans at most 16 bits, or 64 for a double; zeros pad the end.
     columns = np.zeros((kind.size + 9, len(frames)), dtype=np.uint8)
     columns[: kind.size] = octets.T
-    codes: npt.NDArray[Any] = np.empty((len(kind.widths), len(frames)), np.float64 if None in kind.widths else np.int32)
+    codes: npt.NDArray[Any] = np.empty((len(kind.widths), len(frames)), np.float64 if None in kind.widths else np.int16)
     at = kind.first_bit
     for i, width in enumerate(kind.widths):
         byte, bit = divmod(at, 8)

@@ -163,7 +163,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
-    law = attitude, attitude, rate, zeros, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
+    law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
     rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros))
     columns = columns_of(rows, load().model_copy(update={"wire": wire}))
     found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
@@ -320,7 +320,8 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
 def test_the_table_has_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
     settings = load().model_copy(update={"wire": WireSpec(actuators=actuators)})
     one, volts, q = np.ones(1), np.ones((1, actuators)), np.ones((1, 4))
-    law = q, q, q[:, :3], q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
-    rows = Rows(VEHICLE, SESSION, Ticks(one, one, one, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts))
+    law = q, q, q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
+    k = np.arange(1)
+    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts))
     names = {column.name for column in columns_of(rows, settings)}
     assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}

@@ -207,8 +207,7 @@ def test_ticks_are_known_from_since_when_a_record_says_to_the_next_gap(
         writer = TraceWriter("controller", load().wire, 1, 1)
         writer.session = "s"
         writer.record = record_json([Change(session="s", tick=since, gains=Gains(C1=(0.3,) * 3), reference=LEVEL)])
-        batch = writer.take(10**9, 0)
-        header = read_batch(batch)
-        assert header is not None
-        found.add(header.header, batch, tick)
+        batch = read_batch(writer.take(10**9, 0))
+        assert batch is not None
+        found.add(batch.header, batch.tail, tick)
     assert found.unknown([Segment(begins, last) for begins, last in segments], (0, until)) == unknown

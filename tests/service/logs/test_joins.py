@@ -14,10 +14,10 @@ from aeroloop.protocol.messages.trace import RECORD_S, Outcome, Received, Sent, 
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.session import Missing, TraceIndex
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import Missing, TraceIndex
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import Said, edited, rewrite, write_messages
 from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, VEHICLE, Logged, made, make_log, write
