@@ -160,7 +160,7 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
     assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
 
 
-def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_are(whole: Path, tmp_path: Path) -> None:
+def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_are(tmp_path: Path) -> None:
     """A batch of the controller is not there; and none of the controller of another vehicle."""
     others: list[Said] = []
 
@@ -171,13 +171,14 @@ def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_a
         batch = read_batch(one.data)
         return None if batch is not None and 200 in batch.columns["tick"] else one
 
-    path = rewrite(whole, tmp_path / "b.mcap", lacking, others)
+    make_log(tmp_path / "a.mcap", 1200, settings=load())
+    path = rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", lacking, others)
     findings = read(path, vehicle="aero").findings
     lacks = findings.missing_ticks["controller"]
     assert 40 < lacks < 60
     assert (findings.lapses, findings.missing_ticks["plant"], len(findings.missing)) == ({}, 0, 1)
-    for until_s, lines in ((inf, 2), (0.35, 2), (0.2, 0)):  # after the gap no record proves what was in force
-        part = read(path, vehicle="aero", until_s=until_s).findings
+    for since_s, until_s, lines in ((-inf, inf, 1), (0.35, 0.8, 1), (0.6, inf, 0), (-inf, 0.2, 0)):
+        part = read(path, vehicle="aero", since_s=since_s, until_s=until_s).findings
         assert len(part.unseen["missing_ticks"]) == lines
         assert (Limit.parse("gaps=100").unseen(part, []) is None) == (lines == 0)
 
