@@ -114,7 +114,7 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
         """A row of the true states: interpolated between them, for drawing only, and NaN before the first."""
         if not len(theorem.true_k):
             return np.full(len(ticks.k), np.nan)
-        return np.interp(ticks.k, theorem.true_k, theorem.true[row], left=np.nan)
+        return np.asarray(np.interp(ticks.k, theorem.true_k, theorem.true[row], left=np.nan))
 
     angles = np.unwrap(euler_deg(desired), period=360.0, axis=0)
     measured, actual = (
