@@ -50,14 +50,12 @@ def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Prog
         return None if progress is None else lambda part: progress((done + part) / len(logs))
 
     points = MAX_POINTS // len(logs)  # one page holds them all
-    reports = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
-    names = [run.name for run in reports]
-    return named_apart(
-        [
-            replace(run, name=f"{log.resolve().parent.name}/{run.name}") if names.count(run.name) > 1 else run
-            for log, run in zip(logs, reports, strict=True)
-        ]
-    )
+    runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
+    names = [run.name for run in runs]
+    for i, log in enumerate(logs):
+        if names.count(names[i]) > 1:
+            runs[i] = replace(runs[i], name=f"{log.resolve().parent.name}/{names[i]}")
+    return named_apart(runs)
 
 
 def named_apart(reports: Sequence[Report]) -> list[Report]:

@@ -104,15 +104,22 @@ def outline(values: Array, starts: Integers) -> Array:
 
 
 def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iterator[_Quantity]:
-    case, desired, error, true = case_of(settings), ticks.desired, ticks.attitude_error, theorem.true
-    true_norm, true_V, true_error, true_attitude = true[0], true[1], true[2], true[3:].T
+    case, desired, error = case_of(settings), ticks.desired, ticks.attitude_error
 
     def title(name: str, quantity: str) -> str:
         number = NUMBERS.get((name, case))
         return f"{f'Figure {number}: ' if number else ''}{quantity} {CASES[case]}"
 
+    def true_line(row: int) -> Array:
+        """A row of the true states: interpolated between them, for drawing only, and NaN before the first."""
+        if not len(theorem.true_k):
+            return np.full(len(ticks.k), np.nan)
+        return np.asarray(np.interp(ticks.k, theorem.true_k, theorem.true[row], left=np.nan))
+
     angles = np.unwrap(euler_deg(desired), period=360.0, axis=0)
-    measured, actual = (_near(euler_deg(q), angles) for q in (ticks.attitude, true_attitude))
+    measured, actual = (
+        _near(euler_deg(q), angles) for q in (ticks.attitude, np.column_stack([true_line(row) for row in range(3, 7)]))
+    )
     lines = {"measured": measured, "desired": angles, "true": actual}
     yield "angles", "Roll, pitch and yaw", ("roll", "pitch", "yaw"), "°", lines
     lines = {"measured": of_nearer_sign(ticks.attitude, desired), "desired": desired}
@@ -124,15 +131,15 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
     yield "rate_error", title("rate_error", "Angular velocity error"), ("ω_e1", "ω_e2", "ω_e3"), "rad/s", lines
     inputs = ["u" + "₁₂₃₄₅₆₇₈"[i - 1] for i in settings.wire.motors]
     yield "input", title("input", "Input"), inputs, "V", {"commanded": ticks.voltages}
-    lines = {"measured": error_deg(error), "true": true_error}
+    lines = {"measured": error_deg(error), "true": true_line(2)}
     yield "error_angle", "Attitude error, as an angle", ["angle"], "°", lines
     if not settings.loop.lockstep:
         yield "latency", "Loop latency", ["latency"], "µs", {"latency": ticks.latency_ns * 1e-3}
         yield "period", "Period between measurements", ["period"], "µs", {"period": periods_ns(ticks) * 1e-3}
     yield from _law_state(settings, ticks)
-    yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", {"measured": theorem.norm, "true": true_norm}
+    yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", {"measured": theorem.norm, "true": true_line(0)}
     name = "true, with θ̃" if theorem.findings.damping_known else "true, without θ̃"
-    yield "lyapunov", "Lyapunov function", ["V"], "N·m", {"measured, without θ̃": theorem.V, name: true_V}
+    yield "lyapunov", "Lyapunov function", ["V"], "N·m", {"measured, without θ̃": theorem.V, name: true_line(1)}
 
 
 def _law_state(settings: Settings, ticks: Ticks) -> Iterator[_Quantity]:

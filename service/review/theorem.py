@@ -19,13 +19,12 @@ from math import inf, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.session import Array, Integers
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.ticks import Flags, Ticks
 from aeroloop.service.review.events import Truths, judged_ticks
 from aeroloop.service.review.observations import error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
@@ -33,22 +32,20 @@ from aeroloop.service.theorem import lemma
 from aeroloop.service.theorem.any_law import Promise, promise
 from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.invariant import distance, reach
-from aeroloop.service.theorem.lemma import norm
 from aeroloop.service.theorem.mean_square import decay
-
-Flags = npt.NDArray[np.bool_]
 
 
 class TheoremCheck(NamedTuple):
-    """Findings, why each that is null is so, and lines to draw: ‖z^Q‖, its V without θ̃ [N·m], and the true state.
+    """Findings, why each that is null is so, ‖z^Q‖ and its V without θ̃ [N·m] of the n ticks, and m true states.
 
-    Of that ‖z‖, V [N·m], error [deg] and q, interpolated, NaN before the first. Shapes (n,), (n,), (7, n).
+    Of these the ticks, and ‖z‖, V [N·m], error [deg] and q. Shapes (n,), (n,), (m,), (7, m).
     """
 
     findings: TheoremFindings
     reasons: dict[str, str]
     norm: Array
     V: Array
+    true_k: Integers
     true: Array
 
 
@@ -61,7 +58,7 @@ def check_theorem(
     *,
     faults: bool = False,
 ) -> TheoremCheck:
-    """Check a session, by its changes of gains and reference in order, and the certificate in its description.
+    """Check a session, with its changes of gains and reference in order, and its description's certificate, if any.
 
     With `faults` at the plant nothing but Lemma 1 can be judged.
     """
@@ -82,26 +79,24 @@ def check_theorem(
     b = lemma.coordinates(samples.q, omega, at.desired, omega_d, sign, gain)
     theta = None if e is None else e.bounds.theta
     theta_error = np.zeros((1, 3)) if theta is None else theta - estimate
-    true_V = b.norm if law is None else lemma.lyapunov(b, theta_error, law)
-    true = np.vstack([b.norm, true_V, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
+    lyapunov = b.norm if law is None else lemma.lyapunov(b, theta_error, law)
+    true = np.vstack([b.norm, lyapunov, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
     within = (at.k >= since) & (at.k < until)
     true_after = within & (at.k >= settled)
 
     checks, outside, judged, run = list[LemmaCheck](), dict[str, int](), 0, dict[str, Any]()
-    why = "faults acted at the plant" if faults and e is not None else promised.unjudged
-    undecided = None
+    why, undecided = "faults acted at the plant" if faults and e is not None else promised.unjudged, None
     if law is not None and e is not None and within.any():
         sides = {one.equation: one for one in lemma.lemma_inequalities(samples, law, e.known, e.lemma)}
         acts = np.clip(ticks.voltages, -settings.plant.voltage_limit, settings.plant.voltage_limit)
-        error = norm(acts - ticks.unquantized[:, -acts.shape[1] :])
+        error = lemma.norm(acts - ticks.unquantized[:, -acts.shape[1] :])
         refused = ~(error <= e.plant.delta_u * (1 + 1e-9) + 1e-12)  # NaN: no command
         large = true[2] > np.degrees(2 * e.known.half_angle_e) * (1 + 1e-9)
         unmet = {name: sides.pop(name).broken for name in ("C.28", "C.29")}
         unmet |= {"C.30": refused[place], "Assumption 3": large}
         outside = {name: int((within & where).sum()) for name, where in unmet.items()}
         met = within & ~np.any(list(unmet.values()), axis=0)
-        time: Array = np.asarray(at.k * period)
-        checks, judged = [_lemma_check(one, met, time) for one in sides.values()], int(met.sum())
+        checks, judged = [_lemma_check(one, met, at.k, period) for one in sides.values()], int(met.sum())
         if why is None:
             seen, good = np.where(ticks.k >= since, z, 0.0), within & ~large & ~refused[place]
             own_rate = lemma.times(np.swapaxes(lemma.rotation(at.desired), 1, 2), omega_d)
@@ -131,8 +126,7 @@ def check_theorem(
         lemma=checks,
         broken=broken,
     )
-    drawn = [np.interp(ticks.k, at.k, row, left=nan) for row in true] if len(place) else np.full((7, len(z)), nan)
-    return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, np.asarray(drawn))
+    return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, at.k, true)
 
 
 def _guaranteed(
@@ -144,8 +138,7 @@ def _guaranteed(
     `k`, whether the command is `refused`, and ‖z^Q‖ as `seen` are of all ticks; the rest is of true states, at `place`.
     """
     period, late, (z, V) = settings.loop.period, 0 if settings.loop.lockstep else 1, true[:2]
-    time: Array = np.asarray(k[place] * period)
-    apart = np.diff(k[place]) * period
+    time, apart = period * k[place].astype(np.float64), np.diff(k[place]) * period
     most_apart = period + (1.5 / settings.plant.truth_rate_hz if settings.plant.truth_rate_hz else 0.0)
 
     def decays(norms: Array) -> Array:
@@ -160,8 +153,8 @@ def _guaranteed(
     over = np.concatenate([np.zeros(1 + late), failed])[: len(k)]
 
     rate, _, most_eps, most_omega = decays(largest[place])
-    good = good & (k[place] >= late) & (norm((samples.q_Q - samples.q)[:, 1:]) <= most_eps * (1 + 1e-9) + 1e-12)
-    good &= norm(samples.omega_Q - samples.omega) <= most_omega * (1 + 1e-9) + 1e-12
+    good = good & (k[place] >= late) & (lemma.norm((samples.q_Q - samples.q)[:, 1:]) <= most_eps * (1 + 1e-9) + 1e-12)
+    good &= lemma.norm(samples.omega_Q - samples.omega) <= most_omega * (1 + 1e-9) + 1e-12
     joined = good[1:] & good[:-1] & (apart <= most_apart) & (failed[place][1:] == over[place][:-1])
     if not joined.any():
         if not np.isnan(rate[-1]):
@@ -190,7 +183,7 @@ def _guaranteed(
 
 
 def _by_size(sizes: Array, per_octave: int, of: Callable[[float], float | Sequence[float]]) -> Array:
-    """What `of` gives for each size, rounded up to so many an octave. Shape (n,), or (values, n)."""
+    """What `of` gives for each size, rounded up to so many an octave. Shape (n,) or (values, n)."""
     steps, where = np.unique(np.ceil(per_octave * np.log2(np.maximum(sizes, 1e-6))), return_inverse=True)
     return np.array([of(2.0 ** (step / per_octave)) for step in steps.tolist()])[where].T
 
@@ -202,15 +195,15 @@ def _closest(statement: str, left: Array, right: Array, time: Array) -> dict[str
     return dict(zip(names, (len(left), float(share[most]), round(float(time[most]), 9)), strict=True))
 
 
-def _lemma_check(one: lemma.Inequality, judged: Flags, time: Array) -> LemmaCheck:
-    """One inequality at the true states that are judged, with their times [s]. Shapes (n,)."""
-    left, right, time, broken = one.left[judged], one.right[judged], time[judged], one.broken[judged]
+def _lemma_check(one: lemma.Inequality, judged: Flags, k: Integers, period: float) -> LemmaCheck:
+    """One inequality at the true states of ticks k that are judged. Shapes (n,)."""
+    left, right, k, broken = one.left[judged], one.right[judged], k[judged], one.broken[judged]
     found = LemmaCheck(equation=one.equation, what=one.what, samples=len(left), broken=int(broken.sum()))
     if not len(left):
         return found
     ratio = np.where(left > 1e-12, left / np.maximum(right, 1e-300), 0.0)
-    most, broken_s = int(np.argmax(ratio)), round(float(time[np.argmax(broken)]), 9) if broken.any() else None
-    closest = {"closest": float(ratio[most]), "closest_s": round(float(time[most]), 9), "broken_s": broken_s}
+    most, broken_s = int(np.argmax(ratio)), round(int(k[np.argmax(broken)]) * period, 9) if broken.any() else None
+    closest = {"closest": float(ratio[most]), "closest_s": round(int(k[most]) * period, 9), "broken_s": broken_s}
     return found.model_copy(update=closest)
 
 
@@ -239,11 +232,8 @@ def _reasons(found: TheoremFindings, promised: Promise, why: str | None, undecid
 
 
 def _signals(ticks: Ticks, law: AdaptiveSettings | None) -> tuple[Array, Array, Array]:
-    """The sign of the equilibrium approached, C₁'s diagonal [1/s], θ̂ as used [N·m·s/rad]; NaN of another law.
-
-    By the order of `Adaptive.initial` and `Adaptive.gains`. Shapes (n,), (n, 3), (n, 3).
-    """
-    if law is not None:
+    """±1 of the equilibrium approached, C₁'s diagonal [1/s], θ̂ as used [N·m·s/rad]; NaN of another law. (n, …)."""
+    if law is not None:  # by the order of `Adaptive.initial` and `Adaptive.gains`
         return ticks.state_next[:, 3], ticks.gains[:, :3], ticks.state[:, :3]
     nearer = np.where((ticks.attitude * ticks.desired).sum(axis=1) < 0, -1.0, 1.0)
     return nearer, *np.full((2, len(ticks.k), 3), nan)

@@ -65,5 +65,7 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
         for thread in threads:
             thread.join()
         link.close()
-    k = np.arange(len(errors))
-    return figures(wire, loop.period, (k, np.array(errors)), (k, np.array(commands)), unsent=(silent[0], silent[1]))
+    ticks = np.arange(len(errors))
+    return figures(
+        wire, loop.period, (ticks, np.array(errors)), (ticks, np.array(commands)), unsent=(silent[0], silent[1])
+    )

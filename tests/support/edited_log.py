@@ -125,7 +125,7 @@ def at_rest(k: Sequence[int] | npt.NDArray[np.int64], **columns: Any) -> Ticks:
     state = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))  # θ̂, and the sign
     volts = np.zeros((n, 2))
     ticks = Ticks(
-        k, at_ns, at_ns, np.full(n, float(LATENCY_NS)), unknown, unknown, upright, upright, zeros, zeros, zeros, zeros,
+        k, at_ns, at_ns, np.full(n, float(LATENCY_NS)), unknown, unknown, upright, upright, zeros, zeros, zeros,
         volts, volts, np.full((n, 9), 0.3), state, state,
     )  # fmt: skip
     return ticks._replace(**columns)

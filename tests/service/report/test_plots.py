@@ -121,6 +121,6 @@ def test_a_part_without_ticks_or_of_no_length_is_refused(
 ) -> None:
     log = str(logs["quantized"])
     assert execute(["log", "review", log, "--figures", str(tmp_path / "none"), "--from", "7"]) == 1
-    assert capfd.readouterr().err.startswith("aeroloop: nothing to draw after 7 s: the session has 0.4 s")
+    assert capfd.readouterr().err.startswith("aeroloop: there is nothing from 7 s on: the session has 0.4 s")
     assert execute(["log", "review", log, "--from", "2", "--to", "1"]) == 2
     assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Loss
-from aeroloop.protocol.messages.trace import Outcome, Received, read_header
+from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read_header
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
@@ -157,6 +158,29 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
     findings = found(rewrite(path, tmp_path / "b.mcap", edited("plant", stale)))
     assert findings.lapses == {"late": 2, "missed": 2, "stale": 1}
     assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
+
+
+def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_are(tmp_path: Path) -> None:
+    """A batch of the controller is not there; and none of the controller of another vehicle."""
+    others: list[Said] = []
+
+    def lacking(one: Said) -> Said | None:
+        if one.topic != "trace" or not one.key.endswith("controller"):
+            others.append(one._replace(key=one.key.replace("/aero/", "/beta/")))
+            return one
+        batch = read_batch(one.data)
+        return None if batch is not None and 200 in batch.columns["tick"] else one
+
+    make_log(tmp_path / "a.mcap", 1200, settings=load())
+    path = rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", lacking, others)
+    findings = read(path, vehicle="aero").findings
+    lacks = findings.missing_ticks["controller"]
+    assert 40 < lacks < 60
+    assert (findings.lapses, findings.missing_ticks["plant"], len(findings.missing)) == ({}, 0, 1)
+    for since_s, until_s, lines in ((-inf, inf, 1), (0.35, 0.8, 1), (0.6, inf, 0), (-inf, 0.2, 0)):
+        part = read(path, vehicle="aero", since_s=since_s, until_s=until_s).findings
+        assert len(part.unseen["missing_ticks"]) == lines
+        assert (Limit.parse("gaps=100").unseen(part, []) is None) == (lines == 0)
 
 
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:

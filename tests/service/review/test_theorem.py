@@ -35,7 +35,7 @@ from aeroloop.service.theorem.lemma import coordinates
 from aeroloop.service.theorem.mean_square import Decay, decay
 from tests.support import numpy_twin as twin
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
-from tests.support.made_log import SESSION, START_NS, make_log
+from tests.support.made_log import SESSION, START_NS, Changes, make_log
 
 TICKS = 600
 LEMMA = [f"C.{n}" for n in (26, 27, *range(50, 58))]
@@ -327,7 +327,7 @@ def change(tick: int, **parts: Any) -> Change:
 
 
 def test_what_comes_after_an_operators_change_is_not_judged(tmp_path: Path) -> None:
-    changes = {120: (Gains(C1=(5.0, 5.0, 5.0)), None)}
+    changes: Changes = {120: (Gains(C1=(5.0, 5.0, 5.0)), None)}
     make_log(tmp_path / "a.mcap", TICKS, settings=lockstep("plant.ideal=true"), changes=changes, truth_every=1)
     theorem = found(tmp_path / "a.mcap")
     assert (theorem.until_s, theorem.samples) == (0.24, 120)
@@ -381,10 +381,15 @@ def test_the_largest_norm_is_known_once_the_transient_after_the_approach_is_over
 
 
 def test_the_true_line_goes_from_one_published_state_to_the_next_and_begins_with_the_first() -> None:
-    found = trial(at_rest(range(40)), truths_at(10, 30, 90, rates=(0.01, 0.03, 0.09)))
-    assert np.isnan(found.true[0, :10]).all()
-    assert found.true[0, [10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
+    settings, ticks = load(overrides=["reference.kind=hold"]), at_rest(range(40))
+    found = check_theorem(settings, ticks, truths_at(10, 30, 90, rates=(0.01, 0.03, 0.09)))
     assert found.findings.samples == 2  # what lies between is drawn, not judged
+    lines = {
+        (panel.group, line.label): line.values for panel in panels_of(settings, ticks, found)[1] for line in panel.lines
+    }
+    norm = lines["z_norm", "true"]
+    assert np.isnan(norm[:10]).all()
+    assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
 
 
 def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
@@ -412,8 +417,10 @@ def test_the_largest_norm_and_error_are_those_after_the_transient(tmp_path: Path
     norms = []
     for i in range(len(after.k)):
         rate_d = twin.rotation(after.attitude[i]) @ after.desired_rate[i]
-        state = (np.array([row]) for row in (after.attitude[i], after.rate[i], after.desired[i], rate_d))
-        c = coordinates(*state, after.state_next[i : i + 1, 3], np.array(with_theorem(quick()).law.C1))
+        q, omega, q_d, omega_d = (
+            np.array([row]) for row in (after.attitude[i], after.rate[i], after.desired[i], rate_d)
+        )
+        c = coordinates(q, omega, q_d, omega_d, after.state_next[i : i + 1, 3], np.array(with_theorem(quick()).law.C1))
         norms.append(float(c.norm[0]))
     assert theorem.z_norm == pytest.approx(max(norms), rel=1e-9)
     largest = np.linalg.norm(after.attitude_error, axis=1).max()
