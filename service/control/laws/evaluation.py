@@ -10,7 +10,6 @@ import numpy as np
 
 from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.rotations import R, S
-from aeroloop.protocol.wire.symbolic import along_rows, in_columns
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, Now, PythonLaw
 
 
@@ -60,39 +59,6 @@ def law_function(law: ExpressionLaw[Any]) -> ca.Function:
             ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
             {"cse": True},  # the parts overlap, and a law may compute the errors once more, as the paper has them
         )
-
-
-def law_of_many(law: ExpressionLaw[Any], rows: int) -> ca.Function:
-    """Many consecutive ticks of a law of expressions, for readers of logs. Raises as `law_function` does.
-
-    Attitude and state go from row to row; all else is computed in columns (protocol/wire/symbolic.py).
-
-    Args:
-        law: The law.
-        rows: How many ticks; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
-
-    Returns:
-        A function with the inputs of `law_function`: `last` and `state` are those before the first tick, all others
-        have a row per tick. Its outputs: q, u, state_next, eps_e, omega_e, and state_used, from which u was computed.
-    """
-    parts = _parts(law)
-    given = {
-        name: ca.MX.sym(name, *((n, 1) if name in ("last", "state") else (rows, n))) for name, n in parts.sizes.items()
-    }
-    last, first, gains, eps, *motion = (given[name] for name in INPUTS)
-    q = along_rows(parts.attitude, last, eps)
-    e, omega_e = in_columns(parts.errors, rows)(q, *motion[:3])
-    seen = q, *motion, e, omega_e, gains
-    after = along_rows(parts.state, first, *seen) if parts.sizes["state"] else ca.MX(rows, 0)
-    state = ca.vertcat(first.T, after[:-1, :]) if parts.sizes["state"] else ca.MX(rows, 0)
-    u = in_columns(parts.voltages, rows)(state, *seen)
-    return ca.Function(
-        "law_of_many",
-        [given[name] for name in INPUTS],
-        [q, u, after, e[:, 1:4], omega_e, state],
-        list(INPUTS),
-        ["q", "u", "state_next", "eps_e", "omega_e", "state_used"],
-    )
 
 
 INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")

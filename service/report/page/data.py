@@ -17,7 +17,7 @@ from zlib import compress
 
 import numpy as np
 
-from aeroloop.service.logs.traces import Array
+from aeroloop.service.logs.session import Array
 from aeroloop.service.review.report import Line, Mark, Panel, Report
 
 SPREADS: Final = {

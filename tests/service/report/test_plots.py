@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.report import figure_style
 from aeroloop.service.report.figure_style import FORMATS
 from aeroloop.service.report.plots import draw_figures
