@@ -75,6 +75,7 @@ _END: Final = _FOOTER.size + len(MAGIC)
 _CRC_BYTES: Final = 4
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)  # an enumeration's member takes longer to compare
 _PARSED: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT})
+_BEFORE_THE_END: Final = frozenset(range(1, 0x80)) - {Opcode.DATA_END, Opcode.FOOTER}
 _MALFORMED: Final = (struct.error, ValueError, OverflowError, RuntimeError, McapError, zstandard.ZstdError)
 
 T = TypeVar("T")
@@ -243,17 +244,17 @@ class _Reader:
             self._file.seek(offset)
             head = self._file.read(_HEAD.size)
             opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            if opcode == Opcode.DATA_END and length == _CRC_BYTES:
-                return
+            ends = opcode == Opcode.DATA_END and length == _CRC_BYTES
             wrong = ""
             if len(head) < _HEAD.size:
                 wrong = "the file is cut here" if head else "the file ends here, without its index"
-            elif not 0 < opcode <= 0x7F or opcode in (Opcode.DATA_END, Opcode.FOOTER) or length > MAX_RECORD:
+            elif not ends and (opcode not in _BEFORE_THE_END or length > MAX_RECORD):
                 wrong = "no record begins here, and the file has no index"
             elif offset + _HEAD.size + length > self._size:
                 wrong = f"the file is cut within a record of {length} bytes"
             if wrong:
                 self._damage(offset, wrong)
+            if wrong or ends:
                 return
             yield offset, opcode, head + self._file.read(length)
             offset += _HEAD.size + length
