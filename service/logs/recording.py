@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from math import inf
 from pathlib import Path
@@ -417,16 +418,21 @@ def malformed_lines(malformed: Mapping[str, int]) -> list[str]:
 
 def check_memory(needed: int, ticks: int) -> None:
     """Raise ReviewError if so many bytes are not available, for so many ticks."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):  # no Linux
-        return
+    available = available_bytes()
     if needed > available:
         raise ReviewError(
             f"{ticks} ticks take {needed / 2**30:.1f} GiB of memory, and {available / 2**30:.1f} GiB are available: "
             "choose a part with --from and --to"
         )
+
+
+def available_bytes() -> float:
+    """Memory that can still be had; infinite where the system does not say [bytes]."""
+    with suppress(OSError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return float(line.split()[1]) * 1024
+    return inf
 
 
 def _by_address(wanted: Callable[[Address], T | None]) -> Callable[[Channel], T | None]:
