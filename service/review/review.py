@@ -7,11 +7,11 @@ controller, bit for bit. Of several sessions, it judges the longest, unless one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import inf, isnan
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
@@ -21,10 +21,10 @@ from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, Session
 from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
-from aeroloop.service.review.events import Messages, age_us, fault_intervals, happened, read_messages
+from aeroloop.service.review.events import Happened, Messages, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
-from aeroloop.service.review.report import Band, Disagreement, Findings, Recorded, Report, flat
+from aeroloop.service.review.report import Band, Disagreement, FaultInterval, Findings, Recorded, Report, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
@@ -111,7 +111,14 @@ def read(
         raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     messages = read_messages(recording, which, its.settings.wire.actuators)
-    merits, findings, theorem = _judge(recording, its, judged, messages, part, alone=session is not None)
+    first, last = (0, max(its.extent.last.values())) if part is None else its.k[[0, -1]].tolist()
+    seen = _Seen(
+        happened(messages, its, (first, last), session is not None),
+        fault_intervals(messages, its),
+        lapses(its, judged.missed),
+    )
+    its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
+    merits, findings, theorem = _judge(recording, its, judged, messages, seen, part)
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}
     for kind, values in recording.metadata.items():
         facts.setdefault(kind, {}).update(values)
@@ -134,20 +141,25 @@ def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progre
     return read(*paths, progress=progress).report(limits)
 
 
+class _Seen(NamedTuple):
+    """What is seen in the rows of a session alone."""
+
+    happened: Happened
+    faults: list[FaultInterval]
+    lapses: dict[str, int]
+
+
 def _judge(
     recording: Recording,
     session: Session,
     judged: Recomputed,
     messages: Messages,
+    seen: _Seen,
     part: tuple[float, float] | None,
-    *,
-    alone: bool,
 ) -> tuple[Figures, Findings, TheoremCheck]:
-    """Figures, findings and the theorem's lines of a session; if `alone`, without the trips of others."""
+    """Figures, findings and the theorem's lines of a session, whose rows are not needed any more."""
     (vehicle, name), settings, ticks, offset = session.which, session.settings, judged.ticks, judged.offset_ns
-    loop, faults = settings.loop, fault_intervals(messages, session)
-    first, last = (0, max(session.extent.last.values())) if part is None else session.k[[0, -1]].tolist()
-    happening = happened(messages, session, (first, last), alone)
+    loop = settings.loop
     spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, session.which))
     known, latency = not loop.lockstep and not isnan(offset[0]), spreads.get("latency")
     unanswered = None if latency else "no measurement was answered"
@@ -170,7 +182,7 @@ def _judge(
         unsent=judged.unsent,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         log=recording.name,
-        trips=happening.trips,
+        trips=seen.happened.trips,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
         damages=[
             *recording.unread,
@@ -179,7 +191,7 @@ def _judge(
     )
     description = session.descriptions.get("controller")
     certificate = description.certificate if description else None
-    theorem = check_theorem(settings, ticks, messages.truths, session.changes, certificate, faults=bool(faults))
+    theorem = check_theorem(settings, ticks, messages.truths, session.changes, certificate, faults=bool(seen.faults))
     gap_count, longest = gaps(judged.answered, loop.period)
     saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
     missing = [gap for gap in recording.missing if gap.vehicle == vehicle]
@@ -207,15 +219,15 @@ def _judge(
         gap_count=gap_count,
         saturated=saturated,
         invalid=invalid,
-        losses=happening.losses,
+        losses=seen.happened.losses,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
         missing=missing,
         unknown=session.unknown,
         unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
-        lapses=lapses(session, judged.missed),
+        lapses=seen.lapses,
         theorem=theorem.findings,
-        marks=happening.marks,
-        faults=faults,
+        marks=seen.happened.marks,
+        faults=seen.faults,
     )
     return merits, findings, theorem
 
