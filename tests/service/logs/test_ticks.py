@@ -13,11 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.models import Telemetry
+from aeroloop.protocol.messages.trace import Outcome, Received, Sent, TraceWriter
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import load
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs import recording as recording_module
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import EndReplay, replay
@@ -25,7 +27,17 @@ from aeroloop.service.logs.ticks import Ticks, codes_in, levels, recompute
 from aeroloop.service.review.review import review
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws
-from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, VEHICLE, make_log
+from tests.support.made_log import (
+    AN_OPERATORS_WORDS,
+    RUNS,
+    SESSION,
+    VEHICLE,
+    Clock,
+    ControllerEnd,
+    Messages,
+    make_log,
+    write,
+)
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON
 
 CONTINUOUS = [f"wire.{signal}.bits=cont" for signal in ("attitude", "rate", "voltage")]
@@ -131,6 +143,34 @@ def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(
     assert len(its.k) == len(lost)
     for column in (its.attitude, its.desired, its.rate, its.attitude_error, its.rate_error):
         assert not np.isnan(column).any()
+
+
+def test_the_sign_of_q_goes_on_where_only_the_plant_has_a_tick(tmp_path: Path) -> None:
+    """A body that turns by a degree a tick, whose measurements have η ≥ 0: past half a turn q is the negative one."""
+    settings, messages, clocks = load(), Messages(), (Clock("plant"), Clock("controller"))
+    wire, end = settings.wire, ControllerEnd(settings, messages, clocks[1])
+    plant = TraceWriter("plant", wire, RUNS["plant"], 10**12)
+    plant.session = SESSION
+    for k in range(400):
+        for clock in clocks:
+            clock.now_ns = k * settings.loop.period_ns
+        half = np.radians(k) / 2
+        eps = 0.0, 0.0, np.sin(half) * np.sign(np.cos(half))
+        codes = [wire.attitude.quantizer().encode(x) for x in eps] + [wire.rate.quantizer().encode(0.0)] * 3
+        frame, at_ns = wire.measurement.pack(k % wire.measurement.counters, codes), clocks[1].monotonic_ns()
+        if not 250 <= k < 300:
+            command = end.controller.tick(frame, k)
+            end.record(PlantTick(k, frame, Received.FRAME, at_ns, at_ns), command, at_ns)
+        sent_ns, none = clocks[0].monotonic_ns(), bytes(wire.command.size)
+        plant.plant_row(k, k, Sent.FRAME, Sent.NONE, Outcome.NONE, 0, -1, sent_ns, 0, frame, none, [0.0, 0.0])
+        if plant.rows == 200:
+            messages.add("trace", plant.take(sent_ns, clocks[0].time_ns(), final=k == 399), clocks[0], "plant")
+    end.publish(final=True)
+    log = write(tmp_path / "a.mcap", settings, messages.all)
+    ticks = recompute(Recording([log]).session((VEHICLE, SESSION))).ticks
+    assert ticks.k.tolist() == list(range(400))
+    assert np.abs(np.diff(ticks.attitude, axis=0)).max() < 0.2  # of η where ε has its outermost level, 0.996
+    assert ticks.attitude[-1, 0] < -0.9
 
 
 def test_a_part_of_a_session_has_the_ticks_of_the_whole(tmp_path: Path) -> None:
