@@ -152,9 +152,12 @@ def test_what_a_killed_end_did_last_is_named_by_what_the_other_proves(tmp_path: 
     (missing,) = read(tmp_path / "a.mcap").findings.missing
     rows = sum(map(rows_of, last))
     # The plant has acted on all of them but the last.
-    assert missing.model_dump() == Missing(
-        vehicle=VEHICLE, session=SESSION, end="controller", first_tick=600 - rows, last_tick=598, rows=rows - 1
-    ).model_dump()
+    assert (
+        missing.model_dump()
+        == Missing(
+            vehicle=VEHICLE, session=SESSION, end="controller", first_tick=600 - rows, last_tick=598, rows=rows - 1
+        ).model_dump()
+    )
     figures = review(tmp_path / "a.mcap")
     assert figures.skipped_ticks == 0  # they were answered: the plant acted on it
     last = [m for m in messages if end_of(m) == "plant"][-3:]
