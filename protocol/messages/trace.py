@@ -268,15 +268,6 @@ def read_columns(header: Header, payload: bytes) -> Columns:
     return columns
 
 
-def join_columns(batches: Sequence[tuple[Header, bytes]]) -> Columns:
-    """Concatenate the columns of at least one batch of one end and wire, given as for `read_columns`. Shapes (rows,).
-
-    Times stay relative to the base of their own batch; see `Batch.times_ns`.
-    """
-    columns = [read_columns(header, payload) for header, payload in batches]
-    return {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
-
-
 class TraceWriter:
     """Buffers one end's rows and packs them into batches.
 

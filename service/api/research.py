@@ -109,6 +109,5 @@ def read_run(*paths: Path | str, session: str | None = None, vehicle: str | None
     Raises:
         AeroloopError: Not a log, several unrelated runs, or no such session.
     """
-    blocks: list[Ticks] = []
-    read = review.read(*map(Path, paths), session=session, vehicle=vehicle, watch=blocks.append)
-    return RecordedRun(read.session.settings, read.figures, Ticks.joined(blocks))
+    read = review.read(*map(Path, paths), session=session, vehicle=vehicle)
+    return RecordedRun(read.settings, read.figures, read.ticks)

@@ -48,10 +48,10 @@ def review(
         typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
     ] = None,
     since_s: Annotated[
-        float | None, typer.Option("--from", metavar="S", help="Draw from this time on only.", show_default=False)
+        float | None, typer.Option("--from", metavar="S", help="Review from this time on only.", show_default=False)
     ] = None,
     until_s: Annotated[
-        float | None, typer.Option("--to", metavar="S", help="Draw to this time only.", show_default=False)
+        float | None, typer.Option("--to", metavar="S", help="Review to this time only.", show_default=False)
     ] = None,
     require: Require = None,
     session: Annotated[
@@ -72,23 +72,22 @@ def review(
         check_page(html, logs, force)
 
     from aeroloop.service.logs.outputs import writing_into
-    from aeroloop.service.review.observe import DrawnPart
     from aeroloop.service.review.review import read
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import review_account
 
     if since_s is not None and until_s is not None and since_s >= until_s:
         fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
-    part = DrawnPart(-inf if since_s is None else since_s, inf if until_s is None else until_s)
     with guarded():
         with share_bar("reading", hidden=json) as update:
-            judged = read(*logs, session=session, vehicle=vehicle, progress=update, part=part)
+            begin_s, end_s = -inf if since_s is None else since_s, inf if until_s is None else until_s
+            judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=begin_s, until_s=end_s)
         report = judged.report(limits)
         if figures is not None:
             from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(report, judged.session.settings, folder)
+                drawn = draw_figures(report, judged.settings, folder)
             names = ", ".join(dict.fromkeys(path.stem for path in drawn))
             typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:

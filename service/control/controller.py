@@ -70,6 +70,8 @@ class Controller:
         refused: Malformed measurement frames so far.
         fault: Why the law gave no voltages, once it has not; None before.
         invalid: Measurements with the code "no valid value" so far.
+        outputs: What the last tick computed, by name as of `controller_function`; `row` has it one beside the other.
+        last: The same of the last valid tick.
 
     Raises:
         LawError: The law cannot be used, such as one for another number of actuators.
@@ -86,7 +88,7 @@ class Controller:
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)
         self._tick = tick = Tick(wire, self.law, period)
-        self._found, self._kept, self._last = tick.row, tick.kept_row, tick.kept
+        self.row, self._kept, self.outputs, self.last = tick.row, tick.kept_row, tick.found, tick.kept
         self._evaluate, self._codes = tick.evaluate, tick.inputs["codes"]
         self._measured, self._computed = tick.found["measured"], tick.found["computed"]
         self._command: memoryview[int] | Buffer
@@ -136,7 +138,7 @@ class Controller:
         self.motion.set(k * self.period)
         self._evaluate()
         if self._computed[0]:
-            self._kept[:] = self._found
+            self._kept[:] = self.row
             self.tick_index, self.counter = k, counter
             command: Sequence[float] = self._command.tolist()
         else:
@@ -150,7 +152,7 @@ class Controller:
             self.invalid += 1
             return
         self.fault = self._tick.fault or f"law {self.law.settings.kind} gave no number"
-        self._kept[: self._regardless] = self._found[: self._regardless]
+        self._kept[: self._regardless] = self.row[: self._regardless]
         self.tick_index, self.counter = k, counter
 
     def hold(self, frame: bytes) -> bool:
@@ -198,7 +200,7 @@ class Controller:
     def state(self) -> ControllerSnapshot:
         """State for the next tick, besides reference and gains."""
         sent_codes, sent_tick = self._sender.memory
-        held, codes = self._held, tuple(self._last["command"])
+        held, codes = self._held, tuple(self.last["command"])
         return ControllerSnapshot(
             attitude=self.attitude,
             law=self.law_state,
@@ -213,7 +215,7 @@ class Controller:
         codes = state.voltage_codes or [nan] * self.wire.actuators
         rows = {"q": state.attitude, "command": codes}
         for name, values in rows.items():
-            self._last[name][:] = memoryview(array("d", values))
+            self.last[name][:] = memoryview(array("d", values))
         for name, part in self._law_state.items():
             if len(values := state.law.get(name, ())) == len(part):  # that of another law does not count
                 part[:] = memoryview(array("d", values))
@@ -236,34 +238,34 @@ class Controller:
     @property
     def attitude(self) -> Quaternion:
         """q^Q of the last measurement [1]."""
-        return tuple(self._last["q"])  # type: ignore[return-value]  # four elements
+        return tuple(self.last["q"])  # type: ignore[return-value]  # four elements
 
     @property
     def rate(self) -> Vector:
         """ω^Q of the last measurement, body frame [rad/s]."""
-        return tuple(self._last["omega"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last["omega"])  # type: ignore[return-value]  # three elements
 
     @property
     def attitude_error(self) -> tuple[float, float, float]:
         """ε̃ at the last measurement [1]."""
-        return tuple(self._last["eps_e"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last["eps_e"])  # type: ignore[return-value]  # three elements
 
     @property
     def rate_error(self) -> tuple[float, float, float]:
         """ω_e at the last measurement, body frame [rad/s]."""
-        return tuple(self._last["omega_e"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last["omega_e"])  # type: ignore[return-value]  # three elements
 
     @property
     def desired(self) -> Quaternion:
         """q_d at the last measurement [1]."""
-        return tuple(self._last["q_d"])  # type: ignore[return-value]  # four elements
+        return tuple(self.last["q_d"])  # type: ignore[return-value]  # four elements
 
     @property
     def voltages(self) -> list[float]:
         """The last u before quantization [V]. Shape (actuators,)."""
-        return list(self._last["u"])
+        return list(self.last["u"])
 
     @property
     def saturated(self) -> int:
         """Commanded voltages beyond the quantizer's range so far."""
-        return int(self._last["saturated_next"][0])
+        return int(self.last["saturated_next"][0])

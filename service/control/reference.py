@@ -25,7 +25,6 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.wire.attitude import Vector, conjugate, from_euler, product
 from aeroloop.protocol.wire.symbolic import Compiled
-from aeroloop.service.control.columns import in_columns
 
 Floats = NDArray[np.float64]
 
@@ -339,9 +338,9 @@ def desired(reference: Reference, period: float, ticks: int) -> Floats:
     plan = Plan.of(reference)
     t = np.arange(ticks) * period
     piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
-    function = Compiled(in_columns(reference_function(), ticks))
-    given = {"t": t, "start": plan.starts[piece], "quintic": plan.quintic[piece].reshape(ticks, -1)}
-    for name, rows in {**given, "amplitude": plan.amplitude[piece], "frequency": plan.frequency[piece]}.items():
-        np.asarray(function.inputs[name]).reshape(-1, ticks)[:] = rows.T
+    function = Compiled(reference_function().map(ticks))
+    pieces = {"start": plan.starts, "quintic": plan.quintic, "amplitude": plan.amplitude, "frequency": plan.frequency}
+    for name, rows in {"t": t, **{name: values[piece] for name, values in pieces.items()}}.items():
+        np.asarray(function.inputs[name])[:] = rows.ravel()  # CasADi is column-major: one tick after the other
     function()
-    return np.concatenate([np.asarray(memory).reshape(-1, ticks) for memory in function.outputs.values()]).T
+    return np.hstack([np.asarray(memory).reshape(ticks, -1) for memory in function.outputs.values()])

@@ -100,6 +100,7 @@ class Tick:
             before.evaluate()
             found["computed"][0] = 0.0
             if self.without_law or not found["measured"][0]:
+                found["state_next"][:] = self.kept["state_next"]
                 return
             # Copies: the law may keep or change them.
             law.state = {name: np.array(values) for name, values in state.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from math import nan
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,12 +18,13 @@ import numpy as np
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Claim, Refusal
+from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
-from aeroloop.service.figures import Figures, Floats, Integers, Score
+from aeroloop.service.figures import Figures, Floats, Integers, figures
 from aeroloop.service.lab.loop_function import Run, loop_of
 
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
@@ -65,16 +67,21 @@ def experiment(
         course = loop_of(settings).run(settings, ticks, report)
     if course is None:
         return Experiment(_through_frames(settings, duration_s, progress, watch))
-    score = Score(wire, loop.period, settings.plant.watchdog_s)
-    score.errors(np.arange(ticks), course.errors)
-    score.commands(np.arange(ticks), course.voltages)
-    transmit, heartbeat = wire.transmit, heartbeat_of(settings)
+    k, transmit, heartbeat = np.arange(ticks), wire.transmit, heartbeat_of(settings)
     unsent = (
-        ticks - len(sent_ticks(codes, policy, heartbeat))
-        for codes, policy in ((course.measured, transmit.measurement), (course.commanded, transmit.command))
+        ticks - len(sent_ticks(course.measured, transmit.measurement, heartbeat)),
+        ticks - len(sent_ticks(course.commanded, transmit.command, heartbeat)),
     )
-    score.unsent(*unsent)
-    return Experiment(score.figures(reasons=REASONS), course)
+    return Experiment(_figures(settings, (k, course.errors), (k, course.voltages), unsent), course)
+
+
+def _figures(
+    settings: Settings, errors: tuple[Integers, Floats], commands: tuple[Integers, Floats], unsent: tuple[int, int]
+) -> Figures:
+    watchdog_s = settings.plant.watchdog_s
+    return figures(
+        settings.wire, settings.loop.period, errors, commands, watchdog_s=watchdog_s, unsent=unsent, reasons=REASONS
+    )
 
 
 def heartbeat_of(settings: Settings) -> int:
@@ -126,7 +133,6 @@ def _through_frames(
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
     limits = settings.plant.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost)
     endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, limits=limits)
-    score = Score(wire, loop.period, settings.plant.watchdog_s)
     answer = endpoint.claim(
         Claim(controller="experiment", session="lab", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     )
@@ -134,7 +140,9 @@ def _through_frames(
         raise ValueError(answer.reason)
 
     level = wire.voltage.quantizer().level
-    voltages: list[float] = []
+    voltages = [nan] * wire.actuators
+    used, errors, commands = list[int](), list[Vector](), list[list[float]]()
+    silent = [0, 0]  # measurements and commands without a frame
     report_every = loop.ticks(1.0)
     measurement = endpoint.tick(None, 0)
     for k in _undisturbed(loop.ticks(duration_s)):
@@ -145,16 +153,24 @@ def _through_frames(
                 trips = [controller.fault]
             raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
-            score.error(k, controller.attitude_error, sent=measurement != UNCHANGED)
+            used.append(k)
+            errors.append(controller.attitude_error)
+            silent[0] += measurement == UNCHANGED
         if read := wire.command.unpack(command):
             voltages = [level(code) for code in read[1]]
-        score.command(k, voltages, sent=command != UNCHANGED)
+        commands.append(voltages)
+        silent[1] += command == UNCHANGED
         if watch is not None and measurement is not None:
             watch(k, measurement, command)
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
-    return score.figures(reasons=REASONS)
+    return _figures(
+        settings,
+        (np.array(used, dtype=np.int64), np.array(errors).reshape(-1, 3)),
+        (np.arange(len(commands)), np.array(commands).reshape(-1, wire.actuators)),
+        (silent[0], silent[1]),
+    )
 
 
 def _plant(settings: Settings) -> Plant:

@@ -12,23 +12,23 @@ from pathlib import Path
 from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.files import LogFiles, Progress
 from aeroloop.service.logs.mcap_copy import Follow, McapCopy
 from aeroloop.service.logs.mcap_file import Damage
+from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.viewers.channels import Decoder
 
 
-def write_decoded(files: LogFiles, out: Path, progress: Progress) -> tuple[int, list[str], list[str]]:
+def write_decoded(recording: Recording, out: Path, progress: Progress) -> tuple[int, list[str], list[str]]:
     """Write a run as one log with everything decoded; an existing file is overwritten. Raises OSError.
 
     Returns:
         How many messages were written, their topics, and what of the log could not be read, a line each.
     """
     decoder = Decoder(rate_hz=None)
-    for description in files.descriptions.values():
+    for description in recording.descriptions.values():
         decoder.configure(description)
     damages: list[str] = []
-    size, done = sum(path.stat().st_size for path in files.paths), 0
+    size, done = sum(path.stat().st_size for path in recording.paths), 0
     with out.open("wb") as file:
         copy = McapCopy(file, "aeroloop log export")
 
@@ -39,7 +39,7 @@ def write_decoded(files: LogFiles, out: Path, progress: Progress) -> tuple[int, 
             """None for topics that the recorder decoded: they begin with a slash, as no key can."""
             return None if topic.startswith("/") else partial(_decode, copy, decoder, topics.read_key(topic))
 
-        for path in files.paths:
+        for path in recording.paths:
             found: list[Damage] = []
             copy.file(path, found, report, follow)
             done += path.stat().st_size

@@ -1,38 +1,50 @@
 """Export of a log as a table, or as a log with everything decoded.
 
-A table has the ticks that a review judges: both use `TickReader`. Each block is written as soon as it is read.
+A table has the ticks that a review judges. All formats have the same columns by the same names. Parquet has each
+column's unit and description in its field's metadata, and the configuration in the file's; a MATLAB file has them in
+the fields `units`, `descriptions` and `config` of its struct; CSV has a header row only, and 1 and 0 for booleans.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from functools import partial
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
 from pydantic import BaseModel, Field, ValidationError
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.host import versions
-from aeroloop.service.config import ConfigError, Settings
-from aeroloop.service.control.laws.registry import law_of
-from aeroloop.service.logs.files import LogFiles, Progress
+from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
-from aeroloop.service.logs.runs import Block, Run, Taker
-from aeroloop.service.logs.table import Rows, TruthColumns, groups, is_of_tick
-from aeroloop.service.logs.table_files import FILES, ExportError, TableFile
-from aeroloop.service.logs.tick_reader import TickReader
-from aeroloop.service.logs.traces import Integers, SessionKey
+from aeroloop.service.logs.recording import Progress, Recording
+from aeroloop.service.logs.session import Array, Integers, SessionKey
+from aeroloop.service.logs.table import Column, Kind, Rows, TruthColumns, columns_of, is_of_tick
+from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
 ALL: Final = "all"
 
 ENDINGS: Final[dict[Format, str]] = {"parquet": ".parquet", "csv": ".csv", "mat": ".mat", "mcap": "-decoded.mcap"}
 """Ending of a new file's name."""
+
+AT_A_TIME: Final = 1 << 16
+"""Rows that are turned into columns at a time."""
+
+MAT_LIMIT: Final = 2**31 - 1
+"""Bytes that a variable of a MATLAB v5 file may have."""
+
+
+class ExportError(AeroloopError):
+    """A log cannot be exported; one line with the reason."""
 
 
 class Exported(BaseModel, frozen=True):
@@ -64,8 +76,8 @@ def export(
         paths: Logs, folders of logs, or the files of a rotated run.
         to: Format.
         out: The file; the first log's name with another ending if None.
-        session: As of `Run.choose`, or `all` of the vehicle.
-        vehicle: As of `Run.choose`.
+        session: As of `Recording.choose`, or `all` of the vehicle.
+        vehicle: As of `Recording.choose`.
         force: Replace an existing file, unless it is a log.
         progress: Called repeatedly with the share done, 0…1.
 
@@ -74,11 +86,11 @@ def export(
         OutputError: The file must not be written, or cannot.
         ReviewError: The log cannot be read.
     """
-    out = out or beside(paths[0], ENDINGS[to])
+    out = out or with_ending(paths[0], ENDINGS[to])
     sessions: list[str] | None = None
-    unknown: list[Unknown] = []
     try:
         with writing(out, paths, force=force) as part:
+            recording = Recording(paths, progress)
             if to == "mcap":
                 from aeroloop.service.logs.decoded_log import write_decoded
 
@@ -86,11 +98,12 @@ def export(
                     raise ExportError(
                         "--session and --vehicle choose the rows of a table; --to mcap writes the log with all of them"
                     )
-                rows, columns, damages = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
+                rows, columns, damages = write_decoded(recording, part, progress or (lambda _: None))
             else:
-                run = Run(paths, progress)
-                sessions, rows, columns, damages = _table(run, to, part, session, vehicle)
-                unknown = [one for one in run.unknown if f"{one.vehicle}/{one.session}" in sessions]
+                first = recording.choose(None if session == ALL else session, vehicle)
+                chosen = recording.sessions_of(first[0]) if session == ALL else [first]
+                sessions = ["/".join(which) for which in chosen]
+                rows, columns, damages = _write_table(recording, to, part, chosen)
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
@@ -102,93 +115,146 @@ def export(
         columns=columns,
         bytes=size,
         damages=damages,
-        unknown=unknown,
+        unknown=[one for one in recording.unknown if f"{one.vehicle}/{one.session}" in (sessions or ())],
     )
 
 
-def _table(
-    run: Run, to: Format, part: Path, session: str | None, vehicle: str | None
-) -> tuple[list[str], int, list[str], list[str]]:
-    """Write a table; returns its sessions, number of rows and columns' names, and what could not be read."""
-    first = run.choose(None if session == ALL else session, vehicle)
-    chosen = run.sessions_of(first[0]) if session == ALL else [first]
-    settings = run.settings(first)
-    table = groups(
-        settings.wire, settings.loop.period, law_of(settings.law, settings.loop.period, settings.wire.actuators)
-    )
-    names = ["/".join(which) for which in chosen]
-    facts = {
-        "config": settings.description(),
-        "sessions": names,
-        "logs": [str(path) for path in run.files.paths],
-        "recorded_by": {role: found.versions for role, found in run.described(first).items()},
-        "exported_by": versions(),
-    }
-    file = FILES[to](part, table, facts)
-    writers = {which: _Writer(which, file, run.settings(which)) for which in chosen}
-
-    malformed = Counter[str]()
-
-    def truth(vehicle: str, payload: bytes, _: int) -> None:
-        try:
-            true = Truth.model_validate_json(payload)
-        except ValidationError:  # a stranger may publish anything
-            malformed[vehicle] += 1
-            return
-        writer = writers.get((vehicle, true.session or ""))
-        if writer is not None and not is_of_tick(true, writer.actuators):
-            malformed[vehicle] += 1
-        elif writer is not None and true.session_tick is not None:
-            writer.truths.append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
-
-    def route(address: Address) -> Taker | None:
-        return partial(truth, address.vehicle) if address.topic.name == "truth" else None
-
-    for block in run.read(chosen, route):
-        writers[block.which].take(block)
-    rows = sum(writer.rows for writer in writers.values())
-    if not rows:
-        raise ExportError(f"{run.files.name} has no answered measurement to export")
-    file.close()
-    damages = [*run.files.unread, *([f"malformed: {malformed.total()} of truth"] if malformed else [])]
-    return names, rows, [column.name for group in table for column in group.columns], damages
-
-
-class _Writer:
-    """Writes one session's ticks into a table."""
-
-    def __init__(self, which: SessionKey, file: TableFile, settings: Settings) -> None:
-        self.truths: list[tuple[float, ...]] = []  # tick, attitude, rate, voltages
-        self.rows = 0
-        self._which = which
-        self._file = file
-        self.actuators = settings.wire.actuators
-        self._lockstep = settings.loop.lockstep
-        self._reader = TickReader(settings)
-
-    def take(self, block: Block) -> None:
-        judged = self._reader.take(block).judged
-        if self._lockstep:  # the plant waits for each command
-            unknown = np.full(len(judged.k), np.nan)
-            judged = judged._replace(latency_ns=unknown, measurement_delay_ns=unknown, command_delay_ns=unknown)
-        if len(judged.k):
-            self._file.write(Rows(*self._which, judged, self._true_at(judged.k)))
-            self.rows += len(judged.k)
-
-    def _true_at(self, k: Integers) -> TruthColumns:
-        """Latest truth at each tick. Shapes (n, columns)."""
-        columns = 8 + self.actuators
-        self.truths.sort()  # a recorder writes late what it recovers
-        known = np.array(self.truths, dtype=np.float64).reshape(-1, columns)
-        at = np.searchsorted(known[:, 0], k, side="right")
-        self.truths = self.truths[max(0, int(at[-1]) - 1) :]
-        true = np.vstack([np.full((1, columns), np.nan), known])[at]
-        return TruthColumns(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
-
-
-def beside(log: Path, ending: str) -> Path:
+def with_ending(log: Path, ending: str) -> Path:
     """A log's name, or its folder's, with another ending."""
     if log.is_dir():
         log = log.resolve()  # "." has no name
         return log.with_name(log.name + ending)
     return log.with_name(log.stem + ending)
+
+
+def _write_table(
+    recording: Recording, to: Format, part: Path, chosen: Sequence[SessionKey]
+) -> tuple[int, list[str], list[str]]:
+    """Write a table; returns its number of rows, its columns' names, and what could not be read."""
+    facts = {
+        "config": recording.settings(chosen[0]).description(),
+        "sessions": ["/".join(which) for which in chosen],
+        "logs": [str(path) for path in recording.paths],
+        "recorded_by": {role: found.versions for role, found in recording.described(chosen[0]).items()},
+        "exported_by": versions(),
+    }
+    truths, malformed = _truths(recording, chosen)
+    pieces = _pieces(recording, chosen, truths)
+    if (first := next(pieces, None)) is None:
+        raise ExportError(f"{recording.name} has no answered measurement to export")
+    if to == "mat":
+        rows = _write_mat(part, facts, [first, *pieces])
+    else:
+        rows = _write_arrow(part, facts, first, pieces, csv=to == "csv")
+    damages = [*recording.unread, *([f"malformed: {malformed} of truth"] if malformed else [])]
+    return rows, [column.name for column in first], damages
+
+
+def _pieces(
+    recording: Recording, chosen: Sequence[SessionKey], truths: Mapping[SessionKey, Array]
+) -> Iterator[list[Column]]:
+    """The columns of some sessions, some rows at a time."""
+    for which in chosen:
+        session = recording.session(which)
+        ticks = recompute(session).ticks
+        if session.settings.loop.lockstep:  # the plant waits for each command
+            unknown = np.full(len(ticks.k), np.nan)
+            ticks = ticks._replace(latency_ns=unknown, measurement_delay_ns=unknown, command_delay_ns=unknown)
+        for begin in range(0, len(ticks.k), AT_A_TIME):
+            some = ticks.where(slice(begin, begin + AT_A_TIME))
+            yield columns_of(Rows(*which, some, _true_at(truths[which], some.k)), session.settings)
+
+
+def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
+    """True states of sessions in order: tick, attitude, rate, voltages; and how many messages are malformed."""
+    actuators = {which: recording.settings(which).wire.actuators for which in chosen}
+    found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
+    malformed, vehicles = 0, {vehicle for vehicle, _ in chosen}
+    for message in recording.messages(
+        lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in vehicles else None
+    ):
+        try:
+            true = Truth.model_validate_json(message.data)
+        except ValidationError:  # a stranger may publish anything
+            malformed += 1
+            continue
+        which = message.answer, true.session or ""
+        if which in found and not is_of_tick(true, actuators[which]):
+            malformed += 1
+        elif which in found and true.session_tick is not None:
+            found[which].append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
+    return {which: np.array(sorted(its)).reshape(-1, 8 + actuators[which]) for which, its in found.items()}, malformed
+
+
+def _true_at(truths: Array, k: Integers) -> TruthColumns:
+    """Latest truth at each tick. Shapes (n, columns)."""
+    at = np.searchsorted(truths[:, 0], k, side="right")
+    true = np.vstack([np.full((1, truths.shape[1]), np.nan), truths])[at]
+    return TruthColumns(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
+
+
+# ── Files ──
+
+
+def _write_arrow(
+    path: Path, facts: dict[str, Any], first: Sequence[Column], more: Iterator[Sequence[Column]], *, csv: bool
+) -> int:
+    """Write Parquet or CSV by Arrow; returns the number of rows.
+
+    CSV is as of RFC 4180. A number has enough digits to be read back exactly; a missing one is empty. Its booleans are
+    numbers: a reader that guesses types takes `true` beside an empty cell for text.
+    """
+    kinds: list[Kind] = ["int8" if csv and column.kind == "bool" else column.kind for column in first]
+    fields = [
+        pa.field(column.name, pa.type_for_alias(kind), True, {"unit": column.unit, "description": column.description})
+        for column, kind in zip(first, kinds, strict=True)
+    ]
+    schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
+    if csv:
+        options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
+        writer: Any = pyarrow.csv.CSVWriter(path, schema, write_options=options)
+    else:  # a dictionary of doubles makes the file a third larger and its writing slower, quantized or not
+        texts = [column.name for column in first if column.kind == "string"]
+        writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
+    rows = 0
+    with writer:
+        for columns in chain([first], more):
+            arrays = []
+            for column, kind in zip(columns, kinds, strict=True):
+                values = column.values
+                gaps = np.isnan(values) if values.dtype == np.float64 else None
+                if kind in ("bool", "int8"):
+                    values = np.nan_to_num(values).astype(kind)
+                arrays.append(pa.array(values, pa.type_for_alias(kind), mask=gaps))
+            writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+            rows += len(columns[0].values)
+    return rows
+
+
+def _write_mat(path: Path, facts: dict[str, Any], pieces: Sequence[Sequence[Column]]) -> int:
+    """Write a struct `aeroloop`, with a column vector of doubles for each column; returns the number of rows.
+
+    Missing values are NaN. `published_ns` is int64, as a double does not hold it. `vehicle` and `session` are numbers,
+    from 1, into the lists `vehicles` and `sessions`.
+    """
+    import scipy.io  # slow to import, and needed here only
+
+    struct: dict[str, Any] = {}
+    for parts in zip(*pieces, strict=True):
+        values, name = np.concatenate([part.values for part in parts]), parts[0].name
+        if parts[0].kind == "string":
+            texts = list(dict.fromkeys(values))
+            struct[f"{name}s"] = np.array(texts, dtype=object)
+            values = np.array([texts.index(text) + 1 for text in values])
+        struct[name] = values.astype(np.int64 if name == "published_ns" else np.float64)
+    if (size := sum(values.nbytes for values in struct.values())) > MAT_LIMIT:
+        raise ExportError(
+            f"a MATLAB file holds 2 GiB, and these rows take {size / 2**30:.1f} GiB; use --to parquet, "
+            "which MATLAB reads by parquetread"
+        )
+    struct["units"] = {column.name: column.unit for column in pieces[0]}
+    struct["descriptions"] = {column.name: column.description for column in pieces[0]}
+    struct |= {name: json.dumps(fact) for name, fact in facts.items() if name not in struct}
+    with path.open("wb") as file:
+        scipy.io.savemat(file, {"aeroloop": struct}, long_field_names=True, oned_as="column")
+    return sum(len(columns[0].values) for columns in pieces)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import Header, Tail
@@ -50,15 +50,8 @@ class InForce:
         self._changes: list[tuple[int, Change]] = []  # with the first row of their batch
         self._records: list[tuple[int, list[Change]]] = []  # with the last tick of their batch
 
-    def add(self, header: Header, payload: bytes, last_tick: int) -> None:
+    def add(self, header: Header, tail: Tail, last_tick: int) -> None:
         """Add a batch; most have neither a change nor a record."""
-        text = payload[len(payload) - header.tail_bytes :]
-        if b'"changes"' not in text and b'"record"' not in text:
-            return
-        try:
-            tail = Tail.model_validate_json(text)
-        except ValidationError:
-            return
         self._changes += [(header.first_row, change) for change in tail.changes if change.session == header.session]
         if tail.record and all(change.session == header.session for change in tail.record):
             self._records.append((max(last_tick, *(change.tick for change in tail.record)), tail.record))

@@ -6,7 +6,6 @@ a metadata record that equals the last one of its name and key.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import BinaryIO
@@ -30,8 +29,7 @@ class McapCopy:
         self.messages = 0
         self.topics: set[str] = set()
         self._writer = Writer(out, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
-        self._schemas: dict[Hashable, int] = {}
-        self._channels: dict[Hashable, int] = {}
+        self._ids: dict[Hashable, int] = {}  # of schemas and channels
         self._attachments: set[Hashable] = set()
         self._metadata: dict[tuple[str, str | None], dict[str, str]] = {}  # the last of each name and key
         self._writer.start(profile="aeroloop", library=library)
@@ -47,35 +45,32 @@ class McapCopy:
 
         `follow` is called with the topic of each channel; it returns a callback for its messages, or None to drop them.
         """
-        schemas = {0: 0}  # of the new file, by the ids of this one
-        channels: dict[int, tuple[int, Follow] | None] = {}
-        for record in records(path, damages, progress):
-            if isinstance(record, Message):
-                if (known := channels[record.channel_id]) is not None:
-                    channel, follower = known
-                    self.add(channel, record.log_time, record.publish_time, record.data, record.sequence)
-                    follower(record)
-            elif isinstance(record, Schema):
-                schemas[record.id] = self.schema(record.name, record.encoding, record.data)
-            elif isinstance(record, Channel) and record.id not in channels:
-                follower_or_none = follow(record.topic)
-                schema = schemas.get(record.schema_id, 0)
-                channels[record.id] = follower_or_none and (
-                    self.channel(record.topic, record.message_encoding, schema, record.metadata),
-                    follower_or_none,
-                )
-            elif isinstance(record, Metadata):
-                which = record.name, record.metadata.get("key")
-                if self._metadata.get(which) != record.metadata:
-                    self._metadata[which] = record.metadata
-                    self._writer.add_metadata(record.name, record.metadata)
-            elif isinstance(record, Attachment):
-                what = record.name, hashlib.sha256(record.data).digest()
-                if what not in self._attachments:
-                    self._attachments.add(what)
-                    self._writer.add_attachment(
-                        record.create_time, record.log_time, record.name, record.media_type, record.data
-                    )
+        schemas: dict[int, int] = {0: 0}  # of the new file, by the ids of this one
+        channels: dict[int, int] = {}
+        followers: dict[int, Follow] = {}
+
+        def chosen(channel: Channel) -> bool:
+            if (follower := follow(channel.topic)) is None:
+                return False
+            schema = schemas.get(channel.schema_id, 0)
+            channels[channel.id] = self.channel(channel.topic, channel.message_encoding, schema, channel.metadata)
+            followers[channel.id] = follower
+            return True
+
+        for record in records(path, damages, progress, chosen):
+            match record:
+                case Message(id_, log_time, data, publish_time, sequence):
+                    self.add(channels[id_], log_time, publish_time, data, sequence)
+                    followers[id_](record)
+                case Schema():
+                    schemas[record.id] = self.schema(record.name, record.encoding, record.data)
+                case Metadata(name=name, metadata=entries):
+                    if self._metadata.get(which := (name, entries.get("key"))) != entries:
+                        self._metadata[which] = entries
+                        self._writer.add_metadata(name, entries)
+                case Attachment(created, logged, name, kind, data) if (name, data) not in self._attachments:
+                    self._attachments.add((name, data))
+                    self._writer.add_attachment(created, logged, name, kind, data)
 
     def add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int = 0) -> None:
         """Add a message; times in ns since 1970."""
@@ -85,17 +80,17 @@ class McapCopy:
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Id of a schema in the new file."""
         what = name, encoding, data
-        if what not in self._schemas:
-            self._schemas[what] = self._writer.register_schema(name, encoding, data)
-        return self._schemas[what]
+        if what not in self._ids:
+            self._ids[what] = self._writer.register_schema(name, encoding, data)
+        return self._ids[what]
 
     def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str] | None = None) -> int:
         """Id of a channel in the new file; schema 0 is none."""
         what = topic, encoding, schema, tuple((metadata or {}).items())
-        if what not in self._channels:
-            self._channels[what] = self._writer.register_channel(topic, encoding, schema, metadata or {})
+        if what not in self._ids:
+            self._ids[what] = self._writer.register_channel(topic, encoding, schema, metadata or {})
             self.topics.add(topic)
-        return self._channels[what]
+        return self._ids[what]
 
     def finish(self) -> None:
         """Write the last descriptions again, as the recorder does, and the index. Nothing more can be added."""

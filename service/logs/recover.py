@@ -1,21 +1,16 @@
-"""Recovery of a broken log: copies every whole record into a new log with an index.
-
-With an index, as at the end of a file that was closed, a damaged chunk costs itself. Without one, as a killed recorder
-leaves a file, it is read from the front up to where no record begins. Damage is reported.
-"""
+"""Recovery of a broken log: every whole record is copied into a new log with an index, and what was lost is named."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.logs.files import Progress
 from aeroloop.service.logs.mcap_copy import McapCopy
 from aeroloop.service.logs.mcap_file import Damage, NotMcapError
 from aeroloop.service.logs.outputs import writing
+from aeroloop.service.logs.recording import Progress
 
 
 class RecoverError(AeroloopError):
@@ -40,8 +35,7 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
     """
     damages: list[Damage] = []
     try:
-        with broken.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+        size = broken.stat().st_size
         with writing(out, [broken], force=force) as part, part.open("xb") as new:
             copy = McapCopy(new, "aeroloop log recover")
             copy.file(broken, damages, lambda read: progress(read / size) if progress else None)
@@ -53,5 +47,4 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
         raise RecoverError(f"{error}, so there is nothing to recover") from None
     except OSError as error:
         raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
-    lost = [f"at byte {damage.offset}: {damage.what}" for damage in damages]
-    return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=lost)
+    return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=list(map(str, damages)))

@@ -1,6 +1,6 @@
 """Replay of both ends from a log's traces, compared byte for byte.
 
-The controller is sans-I/O and its rows hold all its inputs, so the same rows must give the same commands: which were
+The controller is sans-I/O and its rows hold all its inputs, so a loop over them must give the same commands: which were
 sent, which were silent, and every bit of them. The emulated plant is replayed from its own rows
 (plant_emulator/hosts/replay.py). With another configuration, replay computes what would have been commanded instead;
 the log's plant does not respond to that, so it is no simulation.
@@ -8,32 +8,25 @@ the log's plant does not respond to that, so it is no simulation.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Sequence
-from contextlib import suppress
-from functools import partial
+from collections.abc import Collection, Iterable, Sequence
 from math import sqrt
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.hosts.replay import PlantDifference, PlantReplay, PlantReplayed, why_not
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS, End, Sent, read_batch
-from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.protocol.messages.trace import ENDS, End, Sent
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
-from aeroloop.service.control.controller import Codes
-from aeroloop.service.figures import added, squares
-from aeroloop.service.logs.codes import codes_in, frames_of, levels
-from aeroloop.service.logs.evaluate import Evaluator, held_codes
-from aeroloop.service.logs.files import Progress, ReviewError
 from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.prelude import read_description
-from aeroloop.service.logs.runs import Block, Run, Taker, TraceJoin
-from aeroloop.service.logs.traces import Array, Arrived, Missing, SessionKey, Source
+from aeroloop.service.logs.recording import INDEXING, Progress, Recording
+from aeroloop.service.logs.session import Array, Missing, Session, SessionKey, Source
+from aeroloop.service.logs.ticks import LoggedController, commanded, levels, rows_of
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -83,6 +76,10 @@ class Replay(BaseModel, frozen=True):
         "cannot be computed again from it"
     )
 
+    details: dict[End, list[str]] = Field(
+        default={}, exclude=True, description="by end: what its first difference is in units and steps, in words"
+    )
+
     @property
     def differs(self) -> bool:
         """Whether any end differs."""
@@ -92,143 +89,6 @@ class Replay(BaseModel, frozen=True):
     def complete(self) -> bool:
         """Whether every row of the ends asked for was compared, of all that were written."""
         return not any(self.unseen.values())
-
-
-class Replayer:
-    """Replays one session's controller by an evaluator, whose settings these are; `rows` counts the rows compared."""
-
-    def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
-        self._which = which
-        self._evaluator = evaluator
-        self._wire, self._period = settings.wire, settings.loop.period
-        self.rows = 0
-        self._held: Codes | None = None  # codes of the last command sent
-        self._first: TickDifference | None = None
-        self._first_tick: int | None = None
-        self._ticks = self._differ = 0
-        self._square = self._largest = self._logged = self._computed = 0.0
-
-    def take(self, block: Block) -> None:
-        """Replay the next block."""
-        rows, wire, evaluator = block.controller, self._wire, self._evaluator
-        used = evaluator.used(block)
-        if not rows:
-            return
-        if block.state is not None and (sent := block.state.get("sent_codes")) is not None:
-            self._held = tuple(sent)
-        commands = evaluator.commands(used, evaluator.compute(used))
-        n = len(rows["tick"])
-        sent_as = np.full(n, int(Sent.NONE), dtype=np.uint8)
-        sent_as[used.rows] = np.where(commands.sent, int(Sent.FRAME), int(Sent.SILENT))
-        counters = used.k[commands.sent] % wire.measurement.counters
-        frames = np.zeros((n, wire.command.size), dtype=np.uint8)
-        frames[used.rows[commands.sent]] = frames_of(wire.command, counters, commands.codes[commands.sent])
-        logged = np.ascontiguousarray(rows["command"]).view(np.uint8).reshape(n, -1)
-        differ = (rows["sent_as"] != sent_as) | (logged != frames).any(axis=1)
-        if differ.any() and self._first is None:
-            i = int(np.argmax(differ))
-            tick, was, now = int(rows["tick"][i]), _text(rows["sent_as"][i], logged[i]), _text(sent_as[i], frames[i])
-            self._first = TickDifference(tick=tick, time_s=round(tick * self._period, 9), logged=was, computed=now)
-        self._differ += int(differ.sum())
-        self._ticks += len(used.k)
-        self.rows += n
-        if self._first_tick is None:
-            self._first_tick = int(rows["tick"][0])
-        framed = rows["sent_as"] == Sent.FRAME
-        held, self._held = held_codes(framed, codes_in(wire.command, rows["command"][framed]), self._held)
-        self._compare(held[used.rows], commands.codes)
-
-    def _compare(self, logged: Array, computed: Array) -> None:
-        """Compare voltages."""
-        signal = self._wire.voltage
-        known = ~np.isnan(logged).all(axis=1) if signal.bits else np.ones(len(logged), dtype=np.bool_)
-        if not known.any():
-            return
-        logged, computed = _volts(signal, logged[known]), _volts(signal, computed[known])
-        self._logged = added(self._logged, squares(logged))
-        self._computed = added(self._computed, squares(computed))
-        self._square = added(self._square, squares(computed - logged))
-        self._largest = max(self._largest, float(np.abs(computed - logged).max()))
-
-    def result(self) -> SessionReplay:
-        """Result of all blocks so far."""
-        return SessionReplay(
-            vehicle=self._which[0],
-            session=self._which[1],
-            first_tick=self._first_tick,
-            ticks=self._ticks,
-            differ=self._differ,
-            first_difference=self._first,
-            rms_v=sqrt(self._square / self._ticks) if self._ticks else None,
-            max_v=self._largest if self._ticks else None,
-            u_total_logged=self._logged * self._period,
-            u_total_computed=self._computed * self._period,
-        )
-
-
-def _text(sent_as: int, frame: Array) -> str:
-    return frame.tobytes().hex() if sent_as == Sent.FRAME else Sent(int(sent_as)).name.lower()
-
-
-def _volts(signal: SignalSpec, codes: Array) -> Array:
-    """Voltages that a plant applies; 0 V for a code of no valid value."""
-    volts = levels(signal, codes)
-    return np.where(np.isnan(volts), 0.0, volts)
-
-
-class Plants:
-    """Replays the plants of a run, each process from its first row."""
-
-    def __init__(self, run: Run) -> None:
-        self._descriptions = dict(run.files.first_descriptions)
-        self._replays: dict[Source, PlantReplay] = {}
-        self._reasons: dict[Source, str] = {}  # of those that cannot be replayed
-        self._rows = Counter[Source]()  # of those that are to be compared
-
-    def route(self, address: Address) -> Taker | None:
-        """Takes descriptions: a process is replayed with the configuration that it started with."""
-        return partial(self._description, address) if address.topic.name == "description" else None
-
-    def take(self, arrived: Arrived) -> None:
-        """The next batch of a plant."""
-        source = arrived.source
-        self._rows[source] += arrived.header.rows
-        if source not in self._replays:
-            description = self._descriptions.get((source.vehicle, "plant"))
-            if description is None:
-                self._reasons[source] = f"the log has no description of {source.vehicle}'s plant"
-                return
-            settings = from_description(description.config)
-            if (why := why_not(settings.plant)) is not None:
-                self._reasons[source] = why
-                del self._rows[source]
-                return
-            try:
-                self._replays[source] = PlantReplay(settings.loop, settings.wire, settings.plant)
-            except PlantError as error:
-                self._reasons[source] = str(error)
-                return
-        if (batch := read_batch(arrived.payload)) is not None:
-            self._replays[source].feed(batch)
-
-    def results(self) -> tuple[list[PlantReplayed], str | None, list[str]]:
-        """Result of each process, the reason if there is none or one ends early, and which rows are not compared."""
-        results = {source: replay.result() for source, replay in self._replays.items()}
-        reasons = self._reasons | {source: one.stopped for source, one in results.items() if one.stopped is not None}
-        left = {
-            source: rows - (results[source].ticks if source in results else 0) for source, rows in self._rows.items()
-        }
-        cut = "a batch of them cannot be read"
-        unseen = [
-            f"{rows} of the plant's rows: {reasons.get(source, cut)}" for source, rows in left.items() if rows > 0
-        ]
-        none = None if results else "the log has no trace of a plant"
-        return list(results.values()), next(iter(reasons.values()), none), unseen
-
-    def _description(self, address: Address, payload: bytes, _: int) -> None:
-        with suppress(ValueError):  # malformed: the files' prelude has counted it
-            description = read_description(payload, address)
-            self._descriptions[description.vehicle, description.role] = description
 
 
 def replay(
@@ -247,89 +107,57 @@ def replay(
         ReviewError: It cannot be read, or has no configuration of any end.
         ConfigError: An override is wrong.
     """
-    try:
-        run = Run(paths, progress)
-        run.choose()  # raises where there is no session
-        return _replayed(run, overrides, ends)
-    except ValidationError as error:
-        raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-
-
-def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Replay:
-    own_gains = any(override.startswith("law.") for override in overrides)
-    own_reference = any(override.startswith("reference") for override in overrides)
-    replayers: dict[SessionKey, Replayer] = {}
-    joins: dict[SessionKey, TraceJoin] = {}
-    failed: dict[SessionKey, AeroloopError] = {}
-    plants = Plants(run)
-    for arrived in run.batches(plants.route):
-        source = arrived.source
-        which = source.vehicle, arrived.header.session
-        if source.end == "plant":
-            if "plant" in ends and not overrides:
-                plants.take(arrived)
-            continue
-        if which not in run.extents or "controller" not in ends or which in failed:
-            continue
-        if which not in joins:
-            try:
-                settings = load_over(run.settings(which), overrides)
-                evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
-            except AeroloopError as error:
-                if overrides:
-                    raise
-                failed[which] = error
-                continue
-            replayers[which] = Replayer(which, evaluator, settings)
-            joins[which] = run.join(which, alone=True)
-        if joins[which].add(arrived):
-            for block in joins[which].blocks():
-                replayers[which].take(block)
-    for which, join in joins.items():
-        for block in join.blocks(finished=True):
-            replayers[which].take(block)
-    sessions = [replayer.result() for replayer in replayers.values()]
-    results, reason, plants_unseen = plants.results()
-    if failed and not (sessions or results):
-        raise next(iter(failed.values()))
-    reasons = {} if sessions else {"controller": "the log has no trace of a controller"}
-    if failed:
-        reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
-    left = sum(extent.rows["controller"] for extent in run.extents.values()) - sum(
-        one.rows for one in replayers.values()
-    )
+    recording = Recording(paths, progress)
+    recording.choose()  # raises where there is no session
+    details: dict[End, list[str]] = {}
+    unseen: dict[End, list[str]] = {}
+    reasons: dict[str, str] = {end: "only the other end was replayed" for end in ENDS if end not in ends}
+    sessions: list[SessionReplay] = []
+    plants: list[PlantReplayed] = []
+    if "controller" in ends:
+        failed: dict[SessionKey, AeroloopError] = {}
+        left = 0
+        for which, extent in recording.extents.items():
+            if extent.rows["controller"]:
+                try:
+                    one, words = _replay_session(recording, which, overrides, progress)
+                    sessions.append(one)
+                    details.setdefault("controller", words)
+                except AeroloopError as error:
+                    if overrides:
+                        raise
+                    failed[which] = error
+                    left += extent.rows["controller"]
+        if failed:
+            reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
+        elif not sessions:
+            reasons["controller"] = "the log has no trace of a controller"
+        unseen["controller"] = list(map(str, recording.unknown))
+        if left:
+            unseen["controller"].append(f"{left} of the controller's rows: {reasons['controller']}")
     if overrides:
-        reason = "the plant of a log does not follow another configuration"
-    if reason is not None:
-        reasons["plant"] = reason
-    reasons |= {end: "only the other end was replayed" for end in ENDS if end not in ends}
-    missing = [gap for gap in run.missing if gap.end in ends]
-    not_compared: dict[End, list[str]] = {
-        "controller": [
-            *map(str, run.unknown),
-            *([f"{left} of the controller's rows: {reasons['controller']}"] if left and failed else []),
-        ],
-        "plant": plants_unseen,
-    }
-    unseen = {
-        end: [
-            *(f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows),
-            *its,
-            *run.files.damaged,
-        ]
-        for end, its in not_compared.items()
-        if end in ends and not (overrides and end == "plant")
-    }
+        reasons["plant"] = "the plant of a log does not follow another configuration"
+    elif "plant" in ends:
+        plants, reason, unseen["plant"], details["plant"] = _replay_plants(recording, progress)
+        if reason is not None:
+            reasons["plant"] = reason
+    if "controller" in ends and failed and not (sessions or plants):
+        raise next(iter(failed.values()))
+    missing = [gap for gap in recording.missing if gap.end in ends]
+    for end, its in unseen.items():
+        lacks = [f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows]
+        unseen[end] = [*lacks, *its, *recording.damaged]
     return Replay(
         controller=_sum(sessions),
-        plant=_sum([result for result in results if result.ticks]),
+        plant=_sum([result for result in plants if result.ticks]),
         reasons=reasons,
-        unknown=run.unknown,
+        unknown=recording.unknown,
         sessions=sessions,
-        plants=results,
+        plants=plants,
         missing=missing,
-        damages=run.files.unread,
+        damages=recording.unread,
         unseen=unseen,
+        details=details,
     )
 
 
@@ -337,3 +165,196 @@ def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay 
     if not parts:
         return None
     return EndReplay(ticks=sum(part.ticks for part in parts), differ=sum(part.differ for part in parts))
+
+
+# ── The controller ──
+
+
+def _replay_session(
+    recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None
+) -> tuple[SessionReplay, list[str]]:
+    """Replay a session's controller; the first difference also in words. Raises AeroloopError if that cannot be."""
+    settings = load_over(recording.settings(which), overrides)
+    parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
+    ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
+    session = recording.session(which)
+
+    def again() -> LoggedController:
+        return LoggedController(session, settings, ignored=ignored, resumes=not overrides)
+
+    logged, rows, wire = again(), session.controller, settings.wire
+    sent_as = np.full(len(rows), int(Sent.NONE), dtype=np.uint8)
+    frames = bytearray(len(rows) * wire.command.size)
+    nothing = bytes(session.settings.wire.command.size)
+    differ, first = 0, -1
+
+    def share(done: float) -> None:
+        if progress is not None:
+            progress(INDEXING + (1 - INDEXING) / 2 * done)
+
+    columns = rows_of(rows, "tick", "received_as", "measurement", "sent_as", "command", progress=share)
+    for i, tick, received_as, measurement, logged_as, command in columns:
+        logged.resume(i)
+        answer = logged.answer(tick, received_as, measurement)
+        if answer is not None:
+            sent_as[i] = Sent.FRAME if answer else Sent.SILENT
+            if answer:
+                frames[i * wire.command.size : (i + 1) * wire.command.size] = answer
+        if (sent_as[i], answer or nothing) != (logged_as, command):
+            differ += 1
+            first = i if first < 0 else first
+
+    computed = np.frombuffer(frames, f"V{wire.command.size}")
+    answered = sent_as != Sent.NONE
+    before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
+    after, _ = commanded(session, wire, sent_as, computed)
+    before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
+    square, ticks = _squares_added(after - before), int(answered.sum())
+    difference, details = None, list[str]()
+    if differ:
+        tick = int(rows["tick"][first])
+        was, now = (
+            bytes(frame) if kind == Sent.FRAME else Sent(int(kind)).name.lower()
+            for kind, frame in ((rows["sent_as"][first], rows["command"][first]), (sent_as[first], computed[first]))
+        )
+        difference = TickDifference(
+            tick=tick, time_s=round(tick * settings.loop.period, 9), logged=_text(was), computed=_text(now)
+        )
+        if isinstance(was, bytes) and isinstance(now, bytes):
+            details = in_units(wire.command, _command_signals(wire), was, now)
+        details += _held_before(again(), session, first)
+    return SessionReplay(
+        vehicle=which[0],
+        session=which[1],
+        first_tick=int(rows["tick"][0]) if len(rows) else None,
+        ticks=ticks,
+        differ=differ,
+        first_difference=difference,
+        rms_v=sqrt(square / ticks) if ticks else None,
+        max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
+        u_total_logged=_squares_added(before) * settings.loop.period,
+        u_total_computed=_squares_added(after) * settings.loop.period,
+    ), details
+
+
+def _held_before(again: LoggedController, session: Session, first: int) -> list[str]:
+    """What both ends held before a row of the controller, in words."""
+    for i, *row in rows_of(session.controller[:first], "tick", "received_as", "measurement"):
+        again.resume(i)
+        again.answer(*row)
+    again.resume(first)
+    state = again.controller.state
+    law = "; ".join(f"{name} = {_numbers(values)}" for name, values in state.law.items())
+    sent = state.sent_codes or state.voltage_codes
+    volts = "none" if sent is None else _numbers(levels(again.controller.wire.voltage, np.array(sent))) + " V"
+    lines = [f"the controller held q = {_numbers(state.attitude)}; {law}; command {volts}"]
+    before = np.flatnonzero(session.plant["session_tick"] <= session.controller["tick"][first])
+    if len(before):
+        row = session.plant[before[-1]]
+        lines.append(f"the plant held {_numbers(row['voltages'])} V at its tick {row['session_tick']}")
+    return lines
+
+
+def _text(command: bytes | str) -> str:
+    return command.hex() if isinstance(command, bytes) else command
+
+
+def _squares_added(volts: Array) -> float:
+    """The sum of uᵀu over all rows, added in order: `np.sum` adds pairwise, which rounds differently."""
+    squares = np.zeros(len(volts))
+    for column in volts.T:
+        squares += column * column
+    return float(np.add.accumulate(np.append(0.0, squares))[-1])
+
+
+# ── The plant ──
+
+
+def _replay_plants(
+    recording: Recording, progress: Progress | None
+) -> tuple[list[PlantReplayed], str | None, list[str], list[str]]:
+    """Replay the plants of a run, each process from its first row with the configuration that it started with.
+
+    Returns the result of each process, the reason if there is none or one ends early, which rows are not compared, and
+    the first difference in words.
+    """
+    replays: dict[Source, PlantReplay] = {}
+    reasons: dict[Source, str] = {}
+    settings: dict[Source, Settings] = {}
+    rows: dict[Source, int] = {}
+    for source, (description, count) in recording.plants().items():
+        rows[source] = count
+        if description is None:
+            reasons[source] = f"the log has no description of {source.vehicle}'s plant"
+            continue
+        its = settings[source] = from_description(description.config)
+        if (why := why_not(its.plant)) is not None:
+            reasons[source] = why
+            del rows[source]  # no log of it could be compared
+            continue
+        try:
+            replays[source] = PlantReplay(its.loop, its.wire, its.plant)
+        except PlantError as error:
+            reasons[source] = str(error)
+    done, total = 0, max(1, sum(rows.values()))
+    for source, batch in recording.batches(dict.fromkeys(replays)):
+        replays[source].feed(batch)
+        done += batch.header.rows
+        if progress is not None:
+            progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * min(1.0, done / total))
+    results = {source: one.result() for source, one in replays.items()}
+    reasons |= {source: one.stopped for source, one in results.items() if one.stopped is not None}
+    unseen = []
+    for source, count in rows.items():
+        left = count - (results[source].ticks if source in results else 0)
+        if left > 0:
+            unseen.append(f"{left} of the plant's rows: {reasons.get(source, 'a batch of them cannot be read')}")
+    none = None if results else "the log has no trace of a plant"
+    details = next(
+        (
+            _plant_difference(one.first_difference, settings[source].wire)
+            for source, one in results.items()
+            if one.first_difference is not None
+        ),
+        [],
+    )
+    return list(results.values()), next(iter(reasons.values()), none), unseen, details
+
+
+def _plant_difference(first: PlantDifference, wire: WireSpec) -> list[str]:
+    """The signals of a measurement that differ, in words; any other column is in its own words already."""
+    if first.field != "measurement":
+        return []
+    signals = [(f"ε{i}", "", wire.attitude) for i in (1, 2, 3)] + [(f"ω{i}", " rad/s", wire.rate) for i in (1, 2, 3)]
+    return in_units(wire.measurement, signals, bytes.fromhex(first.logged), bytes.fromhex(first.computed))
+
+
+# ── Differences in words ──
+
+
+def _command_signals(wire: WireSpec) -> list[tuple[str, str, SignalSpec]]:
+    return [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
+
+
+def in_units(
+    kind: FrameFormat, signals: Sequence[tuple[str, str, SignalSpec]], logged: bytes, computed: bytes
+) -> list[str]:
+    """What differs between two frames, a line per signal: both values in units, and how many quantizer steps apart.
+
+    `signals` has the name, the unit and the specification of each.
+    """
+    was, now = kind.unpack(logged), kind.unpack(computed)
+    if was is None or now is None:
+        return [f"the {'logged' if was is None else 'computed'} frame is malformed"]
+    lines = [f"counter: {was[0]} logged, {now[0]} computed"] if was[0] != now[0] else []
+    for (name, unit, signal), a, b in zip(signals, was[1], now[1], strict=True):
+        if a != b and (a == a or b == b):
+            quantizer = signal.quantizer()
+            steps = f", {abs(b - a):g} steps apart" if signal.bits else ""
+            was_v, now_v = (f"{x:g}{unit}" if x == x else "no valid value" for x in map(quantizer.level, (a, b)))
+            lines.append(f"{name}: {was_v} logged, {now_v} computed{steps}")
+    return lines
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return f"[{', '.join(f'{value:.6g}' for value in values)}]"

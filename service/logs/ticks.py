@@ -1,14 +1,49 @@
-"""Ticks of a session in columns, as the controller received and computed them; review, figures and export use them."""
+"""Ticks of a session in columns, as the controller received and computed them; review, figures and export use them.
+
+A row of the controller states what it received for a tick: a frame; silence, which repeats the levels of the last
+frame; or a late frame, whose levels hold from the next tick on. So one loop over `Controller.tick` computes all of it
+again, bit for bit; after missing rows, the log has the controller's state.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Self
+from collections import deque
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from itertools import pairwise
+from math import nan
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
-from aeroloop.service.logs.traces import Array, Integers
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import Received, Sent
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.quantizer import CodedQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Controller, ControllerSnapshot
+from aeroloop.service.control.laws.evaluation import configured_gains
+from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.logs.recording import Progress, ReviewError, check_memory
+from aeroloop.service.logs.session import Array, Integers, Session, Table
+
+Flags = npt.NDArray[np.bool_]
+Codes = npt.NDArray[np.int16] | Array
+"""Codes of frames: integers, or the doubles of a wire that is not quantized."""
+
+AT_A_TIME: Final = 8192
+"""Rows that are turned into Python's objects at a time."""
+
+_BYTES_PER_TICK: Final = 600
+"""Memory that a recomputed tick takes, with what is computed in between."""
+
+WINDOW: Final = 512
+"""Ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second."""
+_LEAST: Final = 16
 
 
 class Ticks(NamedTuple):
@@ -20,7 +55,7 @@ class Ticks(NamedTuple):
             are missing [ns since 1970].
         sent_ns: When it was sent, on the plant's monotonic clock; −1 where it was not [ns].
         latency_ns: From then until the command that answers it was received, on the same clock.
-        measurement_delay_ns: From the plant's sending to the controller's receiving (see clocks.py).
+        measurement_delay_ns: From the plant's sending to the controller's receiving (see `clock_offset`).
         command_delay_ns: From the controller's sending to the plant's receiving.
         attitude: q as measured. The other quantities of the law likewise, in its units.
         voltages: What was commanded; NaN where nothing was, or no valid value [V].
@@ -40,7 +75,6 @@ class Ticks(NamedTuple):
     attitude: Array
     desired: Array
     rate: Array
-    desired_rate: Array
     attitude_error: Array
     rate_error: Array
     voltages: Array
@@ -49,11 +83,361 @@ class Ticks(NamedTuple):
     state: Array
     state_next: Array
 
+    @property
+    def desired_rate(self) -> Array:
+        """ω_d in the body frame [rad/s]. Shape (n, 3)."""
+        return self.rate - self.rate_error
+
     @classmethod
-    def joined(cls, blocks: Sequence[Self]) -> Self:
+    def joined(cls, blocks: Collection[Self]) -> Self:
         """Concatenation of blocks, at least one."""
-        return blocks[0] if len(blocks) == 1 else cls(*map(np.concatenate, zip(*blocks, strict=True)))
+        return cls(*map(np.concatenate, zip(*blocks, strict=True)))
 
     def where(self, chosen: npt.NDArray[np.bool_] | Integers | slice) -> Self:
         """The ticks that a mask, index or slice selects."""
         return type(self)(*(column[chosen] for column in self))  # type: ignore[arg-type]  # as they were
+
+
+class Recomputed(NamedTuple):
+    """A session, computed again.
+
+    Attributes:
+        ticks: Ticks with a valid measurement, up to the last that was answered. A tick that the controller did not
+            compute has the errors of the plant's own measurement.
+        answered: Ticks that a command answered, be it one without a valid value. Shape (m,).
+        voltages: What was commanded at them [V]. Shape (m, actuators).
+        missed: Ticks up to the last answered one that the plant measured and the controller did not compute.
+        unsent: How many of the judged measurements, and of the answers, were silent.
+        measurements: Codes of all measurement frames. Shape (n, 6).
+        commands: Codes of all command frames. Shape (n, actuators).
+        offset_ns: Between both ends' clocks, at the first and the last tick where it is known; NaN if it is not.
+    """
+
+    ticks: Ticks
+    answered: Integers
+    voltages: Array
+    missed: Integers
+    unsent: tuple[int, int]
+    measurements: Codes
+    commands: Codes
+    offset_ns: tuple[float, float]
+
+
+class LoggedController:
+    """The controller of a session, which answers its rows again, one after the other.
+
+    Args:
+        session: The session.
+        settings: What to compute with; the session's configuration if None.
+        ignored: Which parts of the logged changes to leave out.
+        resumes: Continue from the recorded state where rows are missing within the session.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        settings: Settings | None = None,
+        *,
+        ignored: Collection[Literal["gains", "reference"]] = (),
+        resumes: bool = True,
+    ) -> None:
+        settings = settings or session.settings
+        self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._states = session.states if resumes else {i: state for i, state in session.states.items() if i == 0}
+        self._changes: deque[Change] = deque(session.changes)
+        self._ignored: dict[str, None] = dict.fromkeys(ignored)
+
+    def change(self, k: int) -> None:
+        """Apply the logged changes of gains and reference up to tick k."""
+        while self._changes and self._changes[0].tick <= k:
+            self.controller.apply(self._changes.popleft().model_copy(update=self._ignored))
+
+    def resume(self, i: int) -> None:
+        """Continue from the state before row i, where the log has it. Raises ReviewError if it is of no controller."""
+        if i in self._states:
+            try:
+                self.controller.restore(ControllerSnapshot.model_validate(self._states[i]))
+            except ValidationError as error:
+                why = str(error).splitlines()[0]
+                raise ReviewError(f"the log has a state that is not of this version: {why}") from None
+
+    def answer(self, tick: int, received_as: int, frame: bytes) -> bytes | None:
+        """The command that answers a row: a frame, UNCHANGED, or None if there is nothing to answer."""
+        if received_as == Received.LATE:
+            self.controller.hold(frame)
+        if received_as not in (Received.FRAME, Received.SILENT):
+            return None
+        self.change(tick)
+        return self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
+
+
+def rows_of(table: Table, *names: str, progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
+    """Index and some columns of each row, as Python's numbers and bytes."""
+    for begin in range(0, len(table), AT_A_TIME):
+        part = table[begin : begin + AT_A_TIME]
+        yield from zip(range(begin, begin + len(part)), *(part[name].tolist() for name in names), strict=True)
+        if progress is not None:
+            progress((begin + len(part)) / len(table))
+
+
+def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
+    """Compute a session again: what the controller computed, and at the other ticks the errors that the plant measured.
+
+    Raises:
+        ReviewError: It takes more memory than there is.
+        LawError, PluginError: As of `Controller`.
+    """
+    wire, k, controller, plant = session.settings.wire, session.k, session.controller, session.plant
+    at, at_plant = session.at_controller, session.at_plant
+    check_memory(_BYTES_PER_TICK * len(k), len(k))
+    wall, sent, latency, there, back, offset_ns = _timed(session)
+    volts = _voltages(session)
+    columns, over = _computed(session, progress)
+    state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = columns
+    ticks = Ticks(
+        k, wall, sent, latency, there, back, attitude, desired, rate, attitude_error, rate_error,
+        volts, unquantized, _gains(session), state, after,
+    )  # fmt: skip
+    answered = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT) | (session.acted >= 0)
+    until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
+    valid = ~np.isnan(attitude[:until, 0])
+    by_plant = _is(plant, at_plant, "sent_as", Sent.FRAME)
+    by_controller = (at_plant < 0) & _is(controller, at, "received_as", Received.FRAME)
+    frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
+    silent = answered & _is(controller, at, "sent_as", Sent.SILENT)
+    judged = ticks.where(slice(until))
+    return Recomputed(
+        ticks=judged if valid.all() else judged.where(valid),
+        answered=k[answered],
+        voltages=volts[answered],
+        missed=k[:until][over[:until]],
+        unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int(silent.sum())),
+        measurements=codes_in(wire.measurement, frames),
+        commands=codes_in(wire.command, controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]]),
+        offset_ns=offset_ns,
+    )
+
+
+def _computed(session: Session, progress: Progress | None) -> tuple[list[Array], Flags]:
+    """What was computed at each tick, and which ticks the plant measured and the controller did not compute.
+
+    The columns are the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u. Shapes (n, …).
+    """
+    logged, hypothetical = LoggedController(session), LoggedController(session)
+    hypothetical.controller.leave_out_law()
+    outputs, last = logged.controller.outputs, logged.controller.last
+    names = list(outputs)[: list(outputs).index("u") + 1]
+    widths = [len(last["state_next"]), *(len(outputs[name]) for name in names)]
+    ends = np.cumsum(widths).tolist()
+    table = np.full((len(session.k), ends[-1]), nan)
+    memory, row_bytes, state_bytes = table.reshape(-1).view(np.uint8).data, 8 * ends[-1], 8 * ends[0]
+    found, used = logged.controller.row[: ends[-1] - ends[0]].cast("B"), last["state_next"].cast("B")
+    measured, computed = outputs["measured"], outputs["computed"]
+    beside = hypothetical.controller
+    without = beside.row[: ends[-1] - ends[0]].cast("B")
+
+    plant, at_plant = session.plant, session.at_plant
+    framed = np.where(plant["sent_as"] == Sent.FRAME, np.arange(len(plant)), -1)
+    holds = np.maximum.accumulate(framed)  # the row whose frame has the levels of each row
+    over = (at_plant >= 0) & ~_is(plant, at_plant, "sent_as", Sent.NONE)
+    followed = -2
+
+    def compute_without(place: int) -> None:
+        """Compute a tick that only the plant has, from the state that the controller had after its last one."""
+        nonlocal followed
+        row, tick = int(holds[at_plant[place]]), int(session.k[place])
+        if row >= 0:
+            if followed != logged.controller.tick_index:
+                followed = logged.controller.tick_index
+                for name in ("q", "state_next"):
+                    beside.last[name][:] = last[name]
+            hypothetical.change(tick)
+            beside.tick(plant["measurement"][row].tobytes(), tick)
+            if beside.outputs["measured"][0]:
+                at = place * row_bytes
+                memory[at + state_bytes : at + row_bytes] = without
+
+    places = np.full(len(session.controller), -1)
+    its = np.flatnonzero(session.at_controller >= 0)
+    places[session.at_controller[its]] = its
+    waiting = deque(np.flatnonzero(over & (session.at_controller < 0)).tolist())
+    failed: list[int] = []
+    used_state = bytearray(state_bytes)
+    rows = rows_of(session.controller, "tick", "received_as", "measurement", progress=progress)
+    for (i, tick, received_as, frame), place in zip(rows, _integers(places), strict=True):
+        while waiting and session.k[waiting[0]] < tick:
+            compute_without(waiting.popleft())
+        logged.resume(i)
+        used_state[:] = used
+        if logged.answer(tick, received_as, frame) is None:
+            if place >= 0 and over[place]:
+                compute_without(place)
+        elif place >= 0:
+            over[place] = False
+            if measured[0]:
+                at = place * row_bytes
+                memory[at : at + state_bytes] = used_state
+                memory[at + state_bytes : at + row_bytes] = found
+                if not computed[0]:
+                    failed.append(place)
+    for place in waiting:
+        compute_without(place)
+    table[over, ends[-2] :] = nan
+    table[failed, ends[-2] :] = nan
+    return [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)], over
+
+
+def _integers(values: Integers) -> Iterator[int]:
+    for begin in range(0, len(values), AT_A_TIME):
+        yield from values[begin : begin + AT_A_TIME].tolist()
+
+
+def _gains(session: Session) -> Array:
+    """The gains in force at each tick, one beside the other. Shape (n, gains)."""
+    settings = session.settings
+    gains = configured_gains(law_of(settings.law, settings.loop.period, settings.wire.actuators))
+    changes = [change for change in session.changes if change.gains is not None]
+    sets = [list(gains.values())]
+    for change in changes:
+        assert change.gains is not None
+        gains |= change.gains.named
+        sets.append(list(gains.values()))
+    flat = np.array([[value for gain in one for value in gain] for one in sets])
+    which = np.searchsorted([change.tick for change in changes], session.k, side="right")
+    if not len(which) or which[0] == which[-1]:  # a view of one row
+        return np.broadcast_to(flat[which[0] if len(which) else 0], (len(which), flat.shape[1]))
+    return np.asarray(flat[which])
+
+
+def _voltages(session: Session) -> Array:
+    """What was commanded at each tick [V]; NaN where nothing was. Shape (n, actuators)."""
+    at, acted, wire = session.at_controller, session.acted, session.settings.wire
+    volts = np.full((len(session.k), wire.actuators), nan)
+    held, _ = commanded(session, wire, session.controller["sent_as"], session.controller["command"])
+    answers = _is(session.controller, at, "sent_as", Sent.FRAME, Sent.SILENT)
+    volts[answers] = held[at[answers]]
+    others = (at < 0) & _is(session.plant, acted, "received_as", Sent.FRAME)  # the controller's rows are missing
+    volts[others] = levels(wire.voltage, codes_in(wire.command, session.plant["command"][acted[others]]))
+    return volts
+
+
+def commanded(
+    session: Session, wire: WireSpec, sent_as: npt.NDArray[np.uint8], frames: npt.NDArray[np.void]
+) -> tuple[Array, Flags]:
+    """Voltages of the command in force at each of the controller's rows [V], and where one is known. Shapes (n, …).
+
+    NaN is also a command without a valid value. A silent command repeats the last frame, or one of before a gap.
+    """
+    framed = sent_as == Sent.FRAME
+    last = np.maximum.accumulate(np.where(framed, np.arange(len(framed)), -1))
+    volts = levels(wire.voltage, codes_in(wire.command, frames))[last]
+    known = last >= 0
+    for i, state in session.states.items():
+        if (sent := state.get("sent_codes")) is not None:
+            until = i + int(np.argmax(np.append(framed[i:], True)))
+            volts[i:until], known[i:until] = levels(wire.voltage, np.array(sent, np.float64)), True
+    volts[~known] = nan
+    return volts, known
+
+
+# ── Frames ──
+
+
+def codes_in(kind: FrameFormat, frames: npt.NDArray[np.void]) -> Codes:
+    """Codes of well-formed frames, as `unpack` returns them, contiguous in memory per signal. Shape (n, codes)."""
+    octets = np.ascontiguousarray(frames).view(np.uint8).reshape(len(frames), kind.size)
+    # A code starts within a byte and spans at most 16 bits, or 64 for a double; zeros pad the end.
+    columns = np.zeros((kind.size + 9, len(frames)), dtype=np.uint8)
+    columns[: kind.size] = octets.T
+    codes: npt.NDArray[Any] = np.empty((len(kind.widths), len(frames)), np.float64 if None in kind.widths else np.int16)
+    at = kind.first_bit
+    for i, width in enumerate(kind.widths):
+        byte, bit = divmod(at, 8)
+        if width is None:
+            first = np.ascontiguousarray(columns[byte : byte + 8].T).view(">u8")[:, 0].astype(np.uint64)
+            codes[i] = (first << bit | columns[byte + 8] >> (8 - bit)).view(np.float64)
+        else:
+            a, b, c = columns[byte : byte + 3].astype(np.int32)
+            codes[i] = (a << 24 | b << 16 | c << 8) << bit >> (32 - width)  # two's complement: the sign fills
+        at += 64 if width is None else width
+    return codes.T
+
+
+def levels(signal: SignalSpec, codes: Codes) -> Array:
+    """Level of each code, in the signal's unit; NaN for the code of "no valid value". Any shape."""
+    table = _levels(signal)
+    return np.asarray(codes) if table is None else table[codes.astype(np.intp)]  # a negative index counts from the end
+
+
+@lru_cache(maxsize=8)
+def _levels(signal: SignalSpec) -> Array | None:
+    quantizer = signal.quantizer()
+    return np.array(quantizer.levels) if isinstance(quantizer, CodedQuantizer) else None
+
+
+# ── Times ──
+
+
+def clock_offset(forward: Array, backward: Array) -> Array:
+    """The controller's monotonic clock minus the plant's at ticks in order [ns]; NaN before the first estimate.
+
+        forward  = received by the controller − sent by the plant      = delay of the measurement + offset
+        backward = received by the plant − sent by the controller      = delay of the command     − offset
+
+    The offset is half their difference if both ways are equally fast. It is fitted by a straight line over windows of
+    512 ticks, through the half with the shortest round trips. Why: queues and hitches only lengthen a delay. A
+    difference of the medians stays in both delays, with opposite signs. Shapes (n,), NaN where a time is unknown.
+    """
+    found, last_ns = np.empty(len(forward)), nan
+    edges = [*range(0, max(1, len(forward) - WINDOW // 2), WINDOW), len(forward)]
+    for begin, end in pairwise(edges):
+        found[begin:end] = last_ns
+        there, back = forward[begin:end], backward[begin:end]
+        known = np.flatnonzero(~np.isnan(there + back))
+        if len(known) >= _LEAST:
+            # Differences to a base are small; products of times since boot would exceed a double's digits.
+            base = there[known[0]]
+            trip = (there - base) + (back + base)
+            quick = known[trip[known] <= np.median(trip[known])]
+            offset = ((there - base) - (back + base))[quick] / 2
+            apart, middle = quick - quick.mean(), offset.mean()
+            spread = float(apart @ apart) if quick[-1] - quick[0] >= WINDOW // 4 else 0.0
+            slope = float(apart @ (offset - middle)) / spread if spread else 0.0
+            found[begin:end] = base + middle + slope * (np.arange(end - begin) - quick.mean())
+            last_ns = float(found[end - 1])
+    return found
+
+
+def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, tuple[float, float]]:
+    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`."""
+    rows, plant, at, at_plant = session.controller, session.plant, session.at_controller, session.at_plant
+    sent = _times(plant, at_plant, "sent", _is(plant, at_plant, "sent_as", Sent.FRAME))
+    acted = _times(plant, session.acted, "received", _is(plant, session.acted, "received_as", Sent.FRAME))
+    received = _times(rows, at, "received", _is(rows, at, "received_as", Received.FRAME))
+    forward, backward = _since(sent, received), _since(_times(rows, at, "sent"), acted)
+    offset = clock_offset(forward, backward)
+    known = offset[~np.isnan(offset)]
+    wall = np.where(
+        at_plant >= 0,
+        _times(plant, at_plant, "sent") + _times(plant, at_plant, "wall"),
+        _times(rows, at, "received") + _times(rows, at, "wall"),
+    )
+    ends = (float(known[0]), float(known[-1])) if len(known) else (nan, nan)
+    return wall, sent, _since(sent, acted), forward - offset, backward + offset, ends
+
+
+def _times(table: Table, at: Integers, name: str, known: Flags | None = None) -> Integers:
+    """A column's values at places of a table; −1 where the place is −1 or the time is not known. Shape (n,)."""
+    if not len(table):
+        return np.full(len(at), -1)
+    return np.where((at >= 0) if known is None else known, table[name][at], -1)
+
+
+def _is(table: Table, at: Integers, name: str, *kinds: int) -> Flags:
+    """Whether a column's value at places of a table is one of these; false where the place is −1. Shape (n,)."""
+    return np.isin(table[name][at], kinds) & (at >= 0) if len(table) else np.zeros(len(at), dtype=np.bool_)
+
+
+def _since(begin: Integers, end: Integers) -> Array:
+    """How long after one time another was [ns]; NaN where one is unknown. Shape (n,)."""
+    return np.where((begin >= 0) & (end >= 0), (end - begin).astype(np.float64), nan)

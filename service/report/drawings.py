@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from aeroloop.service.logs.traces import Array
+from aeroloop.service.logs.session import Array
 from aeroloop.service.report.rows import grave, micros
 from aeroloop.service.review.report import Line, Panel, Report
 

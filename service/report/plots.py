@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from aeroloop.service.config import Settings
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, figure_style, save, stacked
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report

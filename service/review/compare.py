@@ -12,12 +12,11 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from aeroloop.service.logs.files import Progress
-from aeroloop.service.review.downsample import MAX_POINTS
-from aeroloop.service.review.observe import DrawnPart
+from aeroloop.service.logs.recording import Progress
+from aeroloop.service.review.panels import MAX_POINTS
 from aeroloop.service.review.report import Findings, Report, differences
 from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.review import report
+from aeroloop.service.review.review import read
 
 
 class SettingDifference(BaseModel, frozen=True):
@@ -44,21 +43,19 @@ class Comparison(BaseModel, frozen=True):
 def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
     """A report of every log or folder, each a run of its own, with names that differ, checked against limits.
 
-    Logs of one name are named with their folders. Raises as `report` does.
+    Logs of one name are named with their folders. Raises as `read` does.
     """
 
     def share(done: int) -> Progress | None:
         return None if progress is None else lambda part: progress((done + part) / len(logs))
 
-    part = DrawnPart(points=MAX_POINTS // len(logs))  # one page holds them all
-    reports = [report([log], limits, share(i), part) for i, log in enumerate(logs)]
-    names = [run.name for run in reports]
-    return named_apart(
-        [
-            replace(run, name=f"{log.resolve().parent.name}/{run.name}") if names.count(run.name) > 1 else run
-            for log, run in zip(logs, reports, strict=True)
-        ]
-    )
+    points = MAX_POINTS // len(logs)  # one page holds them all
+    runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
+    names = [run.name for run in runs]
+    for i, log in enumerate(logs):
+        if names.count(names[i]) > 1:
+            runs[i] = replace(runs[i], name=f"{log.resolve().parent.name}/{names[i]}")
+    return named_apart(runs)
 
 
 def named_apart(reports: Sequence[Report]) -> list[Report]:

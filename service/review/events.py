@@ -1,249 +1,203 @@
-"""Events of a session: published events, changes, recorder losses, and the age of measurements.
+"""Events of a session: published events, changes, recorder losses, faults of the plant, and what statuses say.
 
 An event is shown at its sender's time, wherever it stands in the file: with a session tick at that tick, any other by
-its time of publication on the session's clock, as the sender's own trace relates the two (`SenderClocks`). For a
-sender without a trace, such as a recorder, the plant's trace does, so two hosts' clocks are compared there: that is for
-showing only, nothing is decided by it. The first few hundred of each kind become marks and the rest are counted, so
-that a log with a storm of events fits in memory and can be read.
+its time of publication on the session's clock, as the sender's own trace relates the two. For a sender without a
+trace, such as a recorder, the plant's trace does, so two hosts' clocks are compared there: that is for showing only,
+nothing is decided by it. The first few hundred of each kind become marks and the rest are counted.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter, defaultdict
-from math import inf
-from operator import attrgetter, itemgetter
+from collections.abc import Sequence
+from math import ceil, inf, isfinite
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import LOSS_REASONS, Event, Loss, Status
+from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, Loss, Status, Truth
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS
-from aeroloop.protocol.runtime.timing import Histogram
-from aeroloop.service.logs.runs import Block, Taker
-from aeroloop.service.logs.traces import NO_TICK, Extent, Integers, SessionKey
-from aeroloop.service.review.faults import FaultLog
-from aeroloop.service.review.report import Mark
+from aeroloop.service.logs.recording import Recording
+from aeroloop.service.logs.session import Array, Integers, Session, SessionKey
+from aeroloop.service.logs.table import is_of_tick
+from aeroloop.service.review.report import FaultInterval, Mark
 
 MAX_MARKS: Final = 300
-"""Marks kept per kind and role."""
+"""Marks of a kind and role; one more stands for the rest."""
 
-_RECENT: Final = 100_000
-"""Messages kept to find duplicates: a restarted recorder records some messages again."""
+_STRETCH: Final = 4096
+"""Ticks within which a session is taken to run evenly: one in lockstep runs faster or slower than any clock."""
 
-Place = tuple[int, float]
-"""Sort key of a mark: −1 before the session, 0 within it, 1 after it; then its tick, on its sender's clock."""
+_EVENTS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
 
-class _Happened(NamedTuple):
-    """What becomes a mark: its sender's time [ns], its text, its tick where it has one, else whether it is within."""
+class Truths(NamedTuple):
+    """True states by tick, ascending, none twice. Shapes (n,), (n, 4), (n, 3)."""
+
+    k: Integers
+    attitude: Array
+    rate: Array
+
+
+class Published(NamedTuple):
+    """A message with the role that published it, and when, on its wall clock [ns]."""
 
     at_ns: int
-    text: str
-    tick: int | None = None
-    within: bool = False
+    role: str
+    message: Event | Loss | Status
 
 
-class _Kind:
-    """What happened of one kind: the first few hundred by the sender's time, and the count of the rest."""
+class Messages(NamedTuple):
+    """Messages beside the traces: those of one vehicle by time of publication, and one session's true states.
 
-    def __init__(self) -> None:
-        self._first: list[_Happened] = []
-        self._more = 0
-        self._last: _Happened | None = None
-
-    def add(self, one: _Happened) -> None:
-        self._first.append(one)
-        if len(self._first) > 2 * MAX_MARKS:
-            self._prune()
-
-    def all(self) -> list[_Happened]:
-        """Those kept, in order, and one that stands for the rest."""
-        self._prune()
-        if self._last is None:
-            return self._first
-        return [*self._first, self._last._replace(text=f"{self._more} more, the last: {self._last.text}")]
-
-    def _prune(self) -> None:
-        self._first.sort(key=attrgetter("at_ns"))
-        if rest := self._first[MAX_MARKS:]:
-            self._more += len(rest)
-            self._last = max(rest[-1], self._last or rest[-1], key=attrgetter("at_ns"))
-            del self._first[MAX_MARKS:]
-
-
-class SenderClocks:
-    """Senders' wall clocks against one session's ticks, by the first and the last row of each block of either end.
-
-    Between them a time is interpolated, since a session in lockstep runs faster or slower than any clock; outside of
-    the session it is counted in periods.
+    `malformed` counts malformed messages by topic, of any vehicle.
     """
 
-    def __init__(self, period: float) -> None:
-        self._period_ns = period * 1e9
-        self._known: dict[str, list[tuple[int, int]]] = {end: [] for end in ENDS}  # wall time [ns] and tick
+    published: list[Published]
+    truths: Truths
+    malformed: Counter[str]
 
-    def take(self, block: Block) -> None:
-        """Add the session's next block."""
-        for end, rows, at in (
-            ("controller", block.controller, block.at_controller),
-            ("plant", block.plant, block.at_plant),
-        ):
-            if rows and len(there := np.flatnonzero(at >= 0)):
-                ends: Integers = there[[0, -1]]
-                time = np.maximum(rows["received"][at[ends]], rows["sent"][at[ends]])
-                walls = (time + rows["wall"][at[ends]])[time >= 0]
-                self._known[end] += zip(walls.tolist(), block.k[ends][time >= 0].tolist(), strict=True)
-
-    def tick(self, role: str, at_ns: int) -> float:
-        """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
-        known = sorted(self._known.get(role) or self._known["plant"] or self._known["controller"])
-        if not known:
-            return inf
-        (first_ns, first), (last_ns, last) = known[0], known[-1]
-        if at_ns <= first_ns:
-            return first + (at_ns - first_ns) / self._period_ns
-        if at_ns >= last_ns:
-            return last + (at_ns - last_ns) / self._period_ns
-        walls, ticks = zip(*((wall - first_ns, tick) for wall, tick in known), strict=True)
-        return float(np.interp(at_ns - first_ns, walls, ticks))
+    def statuses(self, role: str) -> list[tuple[int, Status]]:
+        """Statuses of a role with their times [ns], in order."""
+        return [(at, one) for at, whose, one in self.published if whose == role and isinstance(one, Status)]
 
 
-class EventLog:
-    """Messages beside the traces, of the session that is judged and its vehicle.
+def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
+    """Read the messages of a session and its vehicle; one that a restarted recorder recorded again counts once."""
+    malformed, published, known = Counter[str](), list[Published](), set[int]()
+    states = array("d")  # rows of tick, q and ω
 
-    Args:
-        which: The session.
-        period: Time between its ticks [s].
-        extent: Its recorded extent.
-        alone: Leave out the trips of other sessions.
-
-    Attributes:
-        statuses: The last status of every vehicle and role.
-        trips: Reason of every trip of the vehicle, in which the plant goes to 0 V by itself.
-        losses: Messages of the vehicle that the recorder lost, by topic.
-        faults: Faults of its plant.
-        unreadable: Malformed messages, by topic.
-    """
-
-    def __init__(
-        self,
-        which: SessionKey,
-        period: float,
-        extent: Extent,
-        *,
-        alone: bool = False,
-    ) -> None:
-        self.unreadable: Counter[str] = Counter()
-        self._alone = alone
-        self.statuses: dict[tuple[str, str], Status] = {}
-        self.trips: list[str] = []
-        self.losses: dict[str, int] = {}
-        self.faults = FaultLog(which[1], period)
-        self._which = which
-        self._period = period
-        self._last_tick = max(extent.last.values(), default=NO_TICK)
-        self._clocks = SenderClocks(period)
-        self._kinds: defaultdict[tuple[str, str], _Kind] = defaultdict(_Kind)
-        self._ages: tuple[Histogram, float, float] = Histogram(), 0.0, 0.0  # medians, largest p99, largest maximum
-        self._recent: dict[int, None] = {}
-        self._status_ns: dict[tuple[str, str], int] = {}
-
-    def route(self, address: Address) -> Taker | None:
-        """Callback for the messages of a key; None if they are not used."""
+    def wanted(address: Address) -> Address | None:
         name = address.topic.name
-        take = {"event": self._event, "loss": self._loss, "status": self._status}.get(name)
-        if take is None:
-            return None
+        return address if name in _EVENTS or (name == "truth" and address.vehicle == which[0]) else None
 
-        def checked(payload: bytes, at_ns: int) -> None:
-            try:
-                take(address, payload, at_ns)
-            except (ValueError, OverflowError):  # a stranger may publish anything, such as 1e999
-                self.unreadable[name] += 1
+    for found in recording.messages(wanted):
+        address, at_ns = found.answer, found.publish_time
+        name = address.topic.name
+        try:
+            if name == "truth":
+                truth = Truth.model_validate_json(found.data)
+                if truth.session != which[1] or truth.session_tick is None:
+                    continue
+                if not is_of_tick(truth, actuators):
+                    raise ValueError
+                states.extend((truth.session_tick, *truth.attitude, *truth.rate))
+            elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
+                known.add(identity)
+                message = _EVENTS[name].model_validate_json(found.data)
+                if (
+                    isinstance(message, Status)
+                    and (age := message.age_us)
+                    and not isfinite(age.p50 + age.p99 + age.max)
+                ):
+                    raise ValueError
+                if address.vehicle == which[0]:
+                    published.append(Published(at_ns, address.role or "recorder", message))
+        except ValueError:  # a stranger may publish anything, such as 1e999
+            malformed[name] += 1
+    rows = np.frombuffer(states).reshape(-1, 8)
+    k, first = np.unique(rows[:, 0].astype(np.int64), return_index=True)
+    truths = Truths(k, rows[first, 1:5], rows[first, 5:])
+    return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
 
-        return checked
 
-    def take(self, block: Block) -> None:
-        """Add the session's next block: its changes of gains and reference, and its times."""
-        self._clocks.take(block)
-        self.faults.take(block)
-        for change in block.changes:
-            self._add("change", "controller", _Happened(change.tick, described(change), change.tick))
+class Happened(NamedTuple):
+    """What happened: marks in order of time, reasons of trips of the vehicle, messages that were lost by topic."""
 
-    @property
-    def age_us(self) -> dict[str, float] | None:
-        """Age of measurements when used: median of all medians, worst p99 and maximum [µs]; None without."""
-        medians, p99, most = self._ages
-        return {"p50": round(medians.percentile(50), 1), "p99": p99, "max": most} if medians.count else None
+    marks: list[Mark]
+    trips: list[str]
+    losses: dict[str, int]
 
-    def marks(self) -> list[Mark]:
-        """Marks of the vehicle in order of time; those outside of the session come first or last."""
-        found = [
-            self._placed(kind, role, one) for (role, kind), happened in self._kinds.items() for one in happened.all()
-        ]
-        return [mark for _, mark in sorted(found, key=itemgetter(0))]
 
-    def _event(self, address: Address, payload: bytes, at_ns: int) -> None:
-        if self._is_duplicate(address.vehicle, payload, at_ns):
-            return
-        event, role = Event.model_validate_json(payload), address.role or ""
-        of_session = event.session == self._which[1]
-        repeats_a_change = event.kind == "changed" and role == "controller" and of_session
-        if address.vehicle != self._which[0] or repeats_a_change:
-            return
-        if event.kind == "tripped" and role == "plant" and (of_session or not self._alone):
-            self.trips.append(event.text)
-        tick = event.tick if of_session and event.tick is not None and 0 <= event.tick <= self._last_tick + 1 else None
-        self._add(event.kind, role, _Happened(at_ns, event.text, tick, event.tick is None and of_session))
+def happened(messages: Messages, session: Session, span: tuple[int, int], alone: bool) -> Happened:
+    """What happened to the vehicle of a session; if `alone`, without the trips of its other sessions.
 
-    def _loss(self, address: Address, payload: bytes, at_ns: int) -> None:
-        if address.vehicle != self._which[0] or self._is_duplicate(address.vehicle, payload, at_ns):
-            return
-        loss = Loss.model_validate_json(payload)
-        lost = topics.read_key(loss.key)
-        name = lost.topic.name if lost else loss.key
-        self.losses[name] = self.losses.get(name, 0) + loss.count
-        self._add("lost", "recorder", _Happened(at_ns, f"{loss.count} of {name} lost: {LOSS_REASONS[loss.reason]}"))
+    Marks outside of the `span` from the first to the last tick have no time.
+    """
+    found: defaultdict[tuple[str, str], list[_Placed]] = defaultdict(list)
+    trips, losses = list[str](), Counter[str]()
+    (first, last), knots, period = span, _knots(session), session.settings.loop.period
+    for at_ns, role, message in messages.published:
+        if isinstance(message, Event):
+            of_session = message.session == session.which[1]
+            if message.kind == "changed" and role == "controller" and of_session:
+                continue  # the change itself is in the trace, with its tick
+            if message.kind == "tripped" and role == "plant" and (of_session or not alone):
+                trips.append(message.text)
+            if of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
+                found[role, message.kind].append(_Placed(message.tick, message.text))
+            else:
+                within = of_session and message.tick is None
+                found[role, message.kind].append(_Placed(_tick_at(knots, role, at_ns, period), message.text, within))
+        elif isinstance(message, Loss):
+            lost = topics.read_key(message.key)
+            name = lost.topic.name if lost else message.key
+            losses[name] += message.count
+            text = f"{message.count} of {name} lost: {LOSS_REASONS[message.reason]}"
+            found["recorder", "lost"].append(_Placed(_tick_at(knots, "recorder", at_ns, period), text))
+    found["controller", "change"] += [_Placed(change.tick, described(change)) for change in session.changes]
+    marks = list[tuple[tuple[int, float], Mark]]()
+    for (role, kind), placed in found.items():
+        kept, rest = placed[:MAX_MARKS], placed[MAX_MARKS:]
+        if rest:
+            kept.append(rest[-1]._replace(text=f"{len(rest)} more, the last: {rest[-1].text}"))
+        for tick, text, within in kept:
+            shown = min(max(tick, first), last) if within else tick
+            outside = -1 if shown < first else 1 if shown > last + 1 else 0
+            time_s = None if outside else round(shown * period, 9)
+            marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
+    return Happened([mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses))
 
-    def _status(self, address: Address, payload: bytes, at_ns: int) -> None:
-        vehicle, role = address.vehicle, address.role
-        if role is None or self._is_duplicate(vehicle, payload, at_ns):
-            return
-        status = Status.model_validate_json(payload)
-        age = status.age_us
-        median_ns = 0 if age is None else round(age.p50 * 1e3)
-        if at_ns > self._status_ns.get((vehicle, role), 0):
-            self._status_ns[vehicle, role], self.statuses[vehicle, role] = at_ns, status
-        if (vehicle, role) == (self._which[0], "plant"):
-            self.faults.status(status, at_ns)
-        if (vehicle, status.session) == self._which and role == "controller" and age is not None:
-            medians, p99, most = self._ages
-            medians.add(median_ns)
-            self._ages = medians, max(p99, age.p99), max(most, age.max)
 
-    def _is_duplicate(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
-        """Whether the very same message was recorded before."""
-        message = hash((vehicle, payload, at_ns))
-        if message in self._recent:
-            return True
-        self._recent[message] = None
-        if len(self._recent) > _RECENT:
-            del self._recent[next(iter(self._recent))]
-        return False
+def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
+    """Age of measurements when used: median of all medians, largest p99 and maximum [µs]; None without."""
+    ages = [one.age_us for _, one in messages.statuses("controller") if one.session == which[1] and one.age_us]
+    if not ages:
+        return None
+    median = round(float(np.median([age.p50 for age in ages])), 1)
+    return {"p50": median, "p99": max(age.p99 for age in ages), "max": max(age.max for age in ages)}
 
-    def _add(self, kind: str, role: str, one: _Happened) -> None:
-        self._kinds[role, kind].add(one)
 
-    def _placed(self, kind: str, role: str, one: _Happened) -> tuple[Place, Mark]:
-        """The mark of what happened. What is of the session is within it, even if published just before or after."""
-        tick = self._clocks.tick(role, one.at_ns) if one.tick is None else one.tick
-        shown = min(max(tick, 0), self._last_tick) if one.within else tick
-        outside = -1 if shown < 0 else 1 if shown > self._last_tick + 1 else 0
-        time_s = None if outside else round(shown * self._period, 9)
-        return (outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=one.text)
+def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]:
+    """Faults of an emulated plant that acted in a session, in order of time.
+
+    Its status has every fault with its begin and end in ticks of the plant, and the trace the plant's tick of each of
+    the session's. So all intervals are known to the tick, whatever event was lost and whenever recording began.
+    """
+    statuses = messages.statuses("plant")
+    own = [i for i, (_, status) in enumerate(statuses) if status.session == session.which[1]]
+    if not own or not len(session.plant):
+        return []
+    last = statuses[own[-1]][1]
+    later = (status for _, status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s)
+    last = next(later, last)  # the first after the session has its final counts
+    before = statuses[own[0] - 1][1] if own[0] else None
+    changed = {}
+    if before is not None and before.uptime_s <= last.uptime_s:  # else of another process
+        changed = {_identity(fault): fault.changed for fault in before.faults}
+    first = int(session.plant["tick"][0]) - int(session.plant["session_tick"][0])
+    ticks, period, found = int(session.k[-1]) + 1, session.settings.loop.period, list[FaultInterval]()
+    for fault in last.faults:
+        if fault.begin_tick is None:
+            continue
+        begin, end = max(0, fault.begin_tick - first), None if fault.end_tick is None else fault.end_tick - first
+        if begin >= ticks or (end is not None and end <= begin):
+            continue
+        found.append(
+            FaultInterval(
+                fault=fault.fault,
+                source=fault.source,
+                begin_s=round(begin * period, 9),
+                end_s=None if end is None or end >= ticks else round(end * period, 9),
+                changed=fault.changed - changed.get(_identity(fault), 0),
+                effect=fault.effect,
+            )
+        )
+    return sorted(found, key=lambda interval: interval.begin_s)
 
 
 def described(change: Change) -> str:
@@ -257,3 +211,63 @@ def described(change: Change) -> str:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")
     return "; ".join(parts)
+
+
+def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
+    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
+    since, begun = 0, set[str]()
+    for change in changes:
+        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
+        if change.start is None and begun == {"gains", "reference"}:
+            return since, change.tick
+        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
+        since = max(since, change.tick + ceil(change.within_s / period))
+    return since, inf
+
+
+class _Placed(NamedTuple):
+    """A tick and a text; `within` if it belongs to the session though published just before or after."""
+
+    tick: float
+    text: str
+    within: bool = False
+
+
+_Knots = dict[str, list[tuple[int, int]]]
+"""Wall time [ns] and tick of some rows of each end, ascending: the first, the last, and at ends of batches between."""
+
+
+def _knots(session: Session) -> _Knots:
+    knots: _Knots = {}
+    for end, rows, at in (
+        ("controller", session.controller, session.at_controller),
+        ("plant", session.plant, session.at_plant),
+    ):
+        its = at[at >= 0]
+        if not len(its):
+            continue
+        ends = np.flatnonzero(np.diff(rows["wall"][its], append=rows["wall"][its[-1]] + 1))
+        stretches = ends[np.searchsorted(ends, np.arange(_STRETCH, len(its), _STRETCH))]
+        some = np.unique([0, *stretches, len(its) - 1])
+        time = np.maximum(rows["received"][its[some]], rows["sent"][its[some]])
+        walls, ticks = time + rows["wall"][its[some]], session.k[at >= 0][some]
+        knots[end] = sorted(zip(walls[time >= 0].tolist(), ticks[time >= 0].tolist(), strict=True))
+    return knots
+
+
+def _tick_at(knots: _Knots, role: str, at_ns: int, period: float) -> float:
+    """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
+    known = knots.get(role) or knots.get("plant") or knots.get("controller")
+    if not known:
+        return inf
+    (first_ns, first), (last_ns, last) = known[0], known[-1]
+    if at_ns <= first_ns:
+        return first + (at_ns - first_ns) / (period * 1e9)
+    if at_ns >= last_ns:
+        return last + (at_ns - last_ns) / (period * 1e9)
+    walls, ticks = zip(*((wall - first_ns, tick) for wall, tick in known), strict=True)
+    return float(np.interp(at_ns - first_ns, walls, ticks))
+
+
+def _identity(fault: FaultStatus) -> tuple[str, str, int | None]:
+    return fault.fault, fault.source, fault.begin_tick

@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.traces import Array, Missing
+from aeroloop.service.logs.session import Array, Missing
 
 
 class Spread(BaseModel, frozen=True):
@@ -40,7 +40,7 @@ class Gap(BaseModel, frozen=True):
 class Mark(BaseModel, frozen=True):
     """An event on the time axis: an event message, a change of gains or reference, a loss."""
 
-    time_s: float | None = Field(description="on the law's clock [s]; null if outside the session")
+    time_s: float | None = Field(description="on the law's clock [s]; null if outside of what was read")
     kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
     role: str
     text: str
@@ -88,9 +88,9 @@ class LemmaCheck(BaseModel, frozen=True):
     what: str = Field(description="its left-hand side, in the paper's letters")
     samples: int
     broken: int = Field(description="samples at which it does not hold")
-    closest: float | None = Field(description="largest left-hand side as a share of the bound")
-    closest_s: float | None = Field(description="when that was, on the law's clock [s]")
-    broken_s: float | None = Field(description="when it was first broken [s]; null where never")
+    closest: float | None = Field(default=None, description="largest left-hand side as a share of the bound")
+    closest_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    broken_s: float | None = Field(default=None, description="when it was first broken [s]; null where never")
 
 
 class TheoremFindings(BaseModel, frozen=True):
@@ -101,38 +101,30 @@ class TheoremFindings(BaseModel, frozen=True):
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
     holds: bool | None = Field(description="null where nothing can be promised")
-    held: bool | None = Field(
-        description="whether the run kept to all that could be judged: Lemma 1, the mean square, the invariant set"
-    )
+    held: bool | None = Field(description="whether the run kept to all of it that could be judged")
     radius: float | None = Field(
-        description="√(δ_Q/k), the root of the mean of ‖z‖² in the long run, of the configured plant while ‖z‖ is as "
-        "at the run's end [1, rad/s]"
+        default=None, description="√(δ_Q/k): the root of the mean of ‖z‖² in the long run, ‖z‖ as at the end [1, rad/s]"
     )
-    pointwise_radius: float | None = Field(
-        description="bound of ‖z‖ at every instant, in the end [1, rad/s]; null where the certificate does not hold"
-    )
+    pointwise_radius: float | None = Field(description="bound of ‖z‖ in the end [1, rad/s]; null unless certified")
     pointwise_deg: float | None = Field(description="the attitude error within that bound [deg]")
     mean_square_share: float | None = Field(
-        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1"
+        default=None,
+        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1",
     )
-    mean_square_at_s: float | None = Field(description="when that was, on the law's clock [s]")
-    mean_square_judged: int = Field(description="true states that judged it")
-    spacing_s: float | None = Field(description="longest time between two of them; the integral is by trapezoids [s]")
+    mean_square_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    mean_square_judged: int = Field(default=0, description="true states that judged it")
+    spacing_s: float | None = Field(default=None, description="longest time between two of them [s]")
     pointwise_share: float | None = Field(
-        description="largest true ‖z‖ as a share of the bound that holds once ‖z‖ has been so small; it never exceeds 1"
+        default=None,
+        description="largest true ‖z‖ as a share of the bound that holds once it was so small; it never exceeds 1",
     )
-    pointwise_at_s: float | None = Field(description="when that was, on the law's clock [s]")
-    pointwise_judged: int = Field(description="true states that judged it")
-    pointwise_since_s: float | None = Field(description="from when on, on the law's clock [s]")
-    pointwise_bound: float | None = Field(description="the least bound that judged [1, rad/s]")
+    pointwise_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    pointwise_judged: int = Field(default=0, description="true states that judged it")
+    pointwise_since_s: float | None = Field(default=None, description="from when on, on the law's clock [s]")
+    pointwise_bound: float | None = Field(default=None, description="the least bound that judged [1, rad/s]")
     transient_s: float = Field(description="how long the transient is taken to last [s]")
-    since_s: float = Field(
-        description="judged from then on, on the law's clock: a session that begins far from its reference first goes "
-        "there [s]"
-    )
-    until_s: float | None = Field(
-        description="judged until gains or reference first changed, on the law's clock [s]; null: to the end"
-    )
+    since_s: float = Field(description="judged from when the reference was reached, on the law's clock [s]")
+    until_s: float | None = Field(description="judged until gains or reference changed [s]; null: to the end")
     z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
     error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
     true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the published true states")
@@ -166,28 +158,20 @@ class Findings(Figures):
     clock_offset_us: list[float] | None = Field(
         default=None, description="the controller's monotonic clock less the plant's, at the first and the last tick"
     )
-    age_us: dict[str, float] | None = Field(
-        description="age of measurements when they were used, as the controller reports it: p50, p99, max"
-    )
+    age_us: dict[str, float] | None = Field(description="age of measurements when used: p50, p99, max")
     gaps: list[Gap] = Field(description="the longest hundred, in order of time")
     gap_count: int
-    saturated: dict[str, float] = Field(
-        description="share of values at a quantizer's outermost level, 0…1: `attitude`, `rate`, `voltage`"
-    )
+    saturated: dict[str, float] = Field(description="share of values at the outermost level, 0…1, by signal")
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
     losses: dict[str, int] = Field(description="messages that the recorder lost, by topic")
-    missing_ticks: dict[str, int] = Field(
-        description="rows of either end that were never recorded, in all of the vehicle's sessions"
-    )
+    missing_ticks: dict[str, int] = Field(description="rows never recorded, in all of the vehicle's sessions, by end")
     missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
     unknown: list[Unknown] = Field(
         default=[],
         description="ticks that no figure counts: the log does not hold the gains, the reference and the law's state",
     )
     unseen: dict[str, list[str]] = Field(
-        default_factory=dict,
-        description="what of the session the figures do not see, by the figure whose limit permits it: ticks that the "
-        "log lacks, and files that are cut or damaged",
+        default_factory=dict, description="what of the session no figure sees, by the figure whose limit permits it"
     )
     lapses: dict[str, int] = Field(
         description="deviations from one frame each way per tick. At the controller: measurements received "

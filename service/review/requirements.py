@@ -85,32 +85,31 @@ class Limit(NamedTuple):
         except ValueError:
             raise LimitError(f"--require {name} takes a number, not {value!r}") from None
 
+    @property
+    def path(self) -> str:
+        """The figure's name in the findings."""
+        return SHORT.get(self.figure, self.figure)
+
     def value(self, figures: Figures) -> float | None:
         """The figure's value; None if it is unavailable."""
-        return value_of(figures, SHORT.get(self.figure, self.figure))
-
-    @property
-    def _lower(self) -> bool:
-        return SHORT.get(self.figure, self.figure) in AT_LEAST
+        return value_of(figures, self.path)
 
     def broken(self, figures: Figures) -> str | None:
         """Why it does not hold, in a line; None if it does. It does not hold for an unavailable figure."""
-        value, words = self.value(figures), ("at least", "less than") if self._lower else ("at most", "more than")
+        value, lower = self.value(figures), self.path in AT_LEAST
         if value is None:
-            return f"{self.figure} is not known, so it is not {words[0]} {self.bound:g}"
-        kept = value >= self.bound if self._lower else value <= self.bound
-        return None if kept else f"{self.figure} is {value:.6g}, {words[1]} {self.bound:g}"
+            return f"{self.figure} is not known, so it is not {'at least' if lower else 'at most'} {self.bound:g}"
+        kept = value >= self.bound if lower else value <= self.bound
+        return None if kept else f"{self.figure} is {value:.6g}, {'less' if lower else 'more'} than {self.bound:g}"
 
     def unseen(self, findings: Findings, limits: Sequence[Limit]) -> str | None:
         """What the figure does not see, in words, if it seems to hold; None where all was seen, or is permitted.
 
         A limit of `missing_ticks` or `damages` among `limits` permits as many.
         """
-        if self.broken(findings) is not None:
-            return None
-        permitted = {SHORT.get(limit.figure, limit.figure) for limit in limits if limit.broken(findings) is None}
+        permitted = {limit.path for limit in limits if limit.broken(findings) is None}
         found = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
-        if not found:
+        if self.broken(findings) is not None or not found:
             return None
         lines = [line for of_one in found.values() for line in of_one]
         more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
@@ -119,15 +118,15 @@ class Limit(NamedTuple):
 
     def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
         """Whether it holds, and what was found, required together with `limits`."""
-        name, value = SHORT.get(self.figure, self.figure), self.value(findings)
-        unit = UNITS[name]
+        value, unseen, unit = self.value(findings), self.unseen(findings, limits), UNITS[self.path]
         space = "" if unit in ("", "°") else " "
-        reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
+        reasons = (why for key, why in findings.reasons.items() if f"{self.path}.".startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
-        text = f"{self.figure} {'≥' if self._lower else '≤'} {self.bound:g}{space}{unit}"
-        unseen = self.unseen(findings, limits)
-        holds = self.broken(findings) is None and unseen is None
-        return Check(text=text, holds=holds, found=found if unseen is None else f"{found}, {unseen}")
+        return Check(
+            text=f"{self.figure} {'≥' if self.path in AT_LEAST else '≤'} {self.bound:g}{space}{unit}",
+            holds=self.broken(findings) is None and unseen is None,
+            found=found if unseen is None else f"{found}, {unseen}",
+        )
 
 
 def broken_limits(limits: Sequence[Limit], findings: Findings) -> list[str]:

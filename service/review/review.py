@@ -1,4 +1,4 @@
-"""Review of a log: every figure, from the log alone.
+"""Review of a log: every figure and finding, from the log alone.
 
 The log holds the configuration (roles' descriptions) and what each end did (traces), so the review recomputes the
 controller, bit for bit. Of several sessions, it judges the longest, unless one is named.
@@ -6,62 +6,129 @@ controller, bit for bit. Of several sessions, it judges the longest, unless one 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-from math import inf
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from math import inf, isnan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.topics import Address
-from aeroloop.service.config import ConfigError
-from aeroloop.service.figures import Figures
-from aeroloop.service.logs.files import Progress, ReviewError
-from aeroloop.service.logs.runs import Run, Taker
-from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import SessionKey
-from aeroloop.service.review.certified_bounds import certified_bounds
-from aeroloop.service.review.events import EventLog
-from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
-from aeroloop.service.review.observe import WHOLE, DrawnPart
-from aeroloop.service.review.report import Band, Findings, Report
+from aeroloop.protocol.messages.models import Description, Percentiles, Status
+from aeroloop.protocol.messages.trace import ENDS
+from aeroloop.service.config import ConfigError, Settings
+from aeroloop.service.figures import Figures, figures
+from aeroloop.service.logs.in_force import Unknown
+from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
+from aeroloop.service.logs.session import Missing, Session
+from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
+from aeroloop.service.review.events import Happened, Messages, age_us, fault_intervals, happened, read_messages
+from aeroloop.service.review.observations import gaps, lapses, saturation, timing
+from aeroloop.service.review.panels import MAX_POINTS, panels_of
+from aeroloop.service.review.report import Band, Disagreement, FaultInterval, Findings, Recorded, Report, flat
 from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.session import Session
-from aeroloop.service.review.theorem_check import TheoremCheck
+from aeroloop.service.review.theorem import TheoremCheck, check_theorem
+
+LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration is a loop's"
+"""Why a session in lockstep has no durations."""
+
+OWN_AFFAIRS: Final = (
+    "loop.realtime", "loop.priority", "loop.cpus", "loop.trace_s", "plant.via", "plant.faults", "plant.fault_seed"
+)  # fmt: skip
+"""Keys that each end has for itself, or that a command sets at the plant alone."""
 
 
-class Review(NamedTuple):
-    """Review of a session of the run `name`: the figures of merit alone, and with everything else the findings."""
+@dataclass(frozen=True)
+class Review:
+    """Review of a session: the figures of merit alone, and with everything else the findings.
+
+    Attributes:
+        figures: The figures of merit.
+        findings: The findings, which have them, too.
+        settings: The session's configuration.
+        ticks: Its ticks that are judged.
+        theorem: What the theorem comes to.
+        name: Name of the run: of its file or folder, without the ending.
+        facts: Facts about software and host, by role.
+        part: From when to when the session was read, on the law's clock; None if all of it was [s].
+    """
 
     figures: Figures
     findings: Findings
-    session: Session
-    which: SessionKey
+    settings: Settings
+    ticks: Ticks
+    theorem: TheoremCheck
     name: str
     facts: dict[str, dict[str, Any]]
+    part: tuple[float, float] | None
 
-    def report(self, limits: Sequence[Limit] = ()) -> Report:
-        """The review as data, checked against limits. Raises ReviewError if the part to draw has no tick."""
-        observer, part = self.session.observer, self.session.part
-        time, panels = observer.lines()
-        if self.session.settings.loop.lockstep:
-            panels = [panel for panel in panels if panel.group not in ("latency", "period")]
-        if not len(time) and part[:2] != WHOLE[:2]:
-            until, lasts = "" if part.until_s == inf else f" and before {part.until_s:g} s", self.findings.duration_s
-            raise ReviewError(f"nothing to draw after {max(0.0, part.since_s):g} s{until}: the session has {lasts:g} s")
+    def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
+        """The review as data, checked against limits, with lines of at most so many points."""
+        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
+        checks = [limit.check(self.findings, limits) for limit in limits]
         return Report(
             name=self.name,
-            findings=self.findings.model_copy(
-                update={"checks": [limit.check(self.findings, limits) for limit in limits]}
-            ),
+            findings=self.findings.model_copy(update={"checks": checks}),
             time=time,
             panels=panels,
-            thinned=observer.thinned,
-            settings=self.session.settings.description(),
+            thinned=thinned,
+            settings=self.settings.description(),
             facts=self.facts,
-            part=None if part[:2] == WHOLE[:2] else part[:2],
+            part=self.part,
             bands=[Band(fault.begin_s, fault.end_s, fault.fault) for fault in self.findings.faults],
         )
+
+
+def read(
+    *paths: Path,
+    session: str | None = None,
+    vehicle: str | None = None,
+    progress: Progress | None = None,
+    since_s: float = -inf,
+    until_s: float = inf,
+) -> Review:
+    """Read a run and judge a session. The figures list what cannot be read of a broken file.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+        session: As of `Recording.choose`.
+        vehicle: As of `Recording.choose`.
+        progress: Called repeatedly with the share done, 0…1.
+        since_s: From when on to read the session, on the law's clock [s].
+        until_s: Until when [s].
+
+    Raises:
+        ReviewError: Not a log, several unrelated runs, no such session, or nothing of it in this time.
+    """
+    try:
+        recording = Recording(paths, progress)
+        which = recording.choose(session, vehicle)
+        its = recording.session(which, since_s, until_s)
+    except ConfigError as error:
+        raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
+    part = None if (since_s, until_s) == (-inf, inf) else (since_s, until_s)
+    if part is not None and not len(its.k):
+        lasts = its.extent.ticks * its.settings.loop.period
+        raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
+    judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
+    messages = read_messages(recording, which, its.settings.wire.actuators)
+    first, last = (0, max(its.extent.last.values())) if part is None else its.k[[0, -1]].tolist()
+    seen = _Seen(
+        happened(messages, its, (first, last), session is not None),
+        fault_intervals(messages, its),
+        lapses(its, judged.missed),
+    )
+    its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
+    merits, findings, theorem = _judge(recording, its, judged, messages, seen, part)
+    facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}
+    for kind, values in recording.metadata.items():
+        facts.setdefault(kind, {}).update(values)
+    for _, role, status in messages.published:
+        if isinstance(status, Status) and status.notes:
+            facts.setdefault(role, {})["notes"] = status.notes
+    first = paths[0].resolve()
+    name = first.name if first.is_dir() else first.stem
+    name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
+    return Review(merits, findings, its.settings, judged.ticks, theorem, name, facts, part)
 
 
 def review(*paths: Path) -> Figures:
@@ -69,69 +136,116 @@ def review(*paths: Path) -> Figures:
     return read(*paths).figures
 
 
-def report(
-    paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None, part: DrawnPart = WHOLE
-) -> Report:
-    """Report of a run's longest session, checked against limits; `part` of it is drawn. Raises as `read` does."""
-    return read(*paths, progress=progress, part=part).report(limits)
+def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
+    """Report of a run's longest session, checked against limits. Raises as `read` does."""
+    return read(*paths, progress=progress).report(limits)
 
 
-def read(
-    *paths: Path,
-    session: str | None = None,
-    vehicle: str | None = None,
-    watch: Callable[[Ticks], None] | None = None,
-    progress: Progress | None = None,
-    part: DrawnPart = WHOLE,
-) -> Review:
-    """Read a run and judge a session. The figures list what cannot be read of a broken file.
+class _Seen(NamedTuple):
+    """What is seen in the rows of a session alone."""
 
-    Args:
-        paths: Logs, folders of logs, or the files of a rotated run.
-        session: As of `Run.choose`.
-        vehicle: As of `Run.choose`.
-        watch: Called with every block of the session's ticks.
-        progress: Called repeatedly with the share done, 0…1.
-        part: What of it is drawn.
+    happened: Happened
+    faults: list[FaultInterval]
+    lapses: dict[str, int]
 
-    Raises:
-        ReviewError: Not a log, several unrelated runs, or no such session.
-    """
-    try:
-        run = Run(paths, progress)
-        which = run.choose(session, vehicle)
-        settings, description = run.settings(which), run.described(which).get("controller")
 
-        def check(changes: Sequence[Change]) -> TheoremCheck:
-            certified = certified_bounds(settings, changes, description.certificate if description else None)
-            return TheoremCheck(certified, settings)
-
-        missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
-        judged = Session(settings, check, missing, watch, part)
-        events = EventLog(which, settings.loop.period, run.extents[which], alone=session is not None)
-
-        def route(address: Address) -> Taker | None:
-            if address.topic.name == "truth":
-                return judged.truth if address.vehicle == which[0] else None
-            return events.route(address)
-
-        for block in run.read([which], route):
-            events.take(block)
-            judged.take(block)
-        judged.finish()
-    except ConfigError as error:
-        raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    latency, reason = latency_of(judged)
-    unreadable = Counter(events.unreadable)
-    if judged.unreadable:
-        unreadable["truth"] += judged.unreadable
-    damages = [f"malformed: {count} of {topic}" for topic, count in sorted(unreadable.items())]
-    figures = judged.score.figures(
-        latency=latency,
-        log=run.files.name,
-        trips=events.trips,
-        reasons={} if latency else {"latency_us": reason},
-        damages=[*run.files.unread, *damages],
+def _judge(
+    recording: Recording,
+    session: Session,
+    judged: Recomputed,
+    messages: Messages,
+    seen: _Seen,
+    part: tuple[float, float] | None,
+) -> tuple[Figures, Findings, TheoremCheck]:
+    """Figures, findings and the theorem's lines of a session, whose rows are not needed any more."""
+    (vehicle, name), settings, ticks, offset = session.which, session.settings, judged.ticks, judged.offset_ns
+    loop = settings.loop
+    spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, session.which))
+    known, latency = not loop.lockstep and not isnan(offset[0]), spreads.get("latency")
+    unanswered = None if latency else "no measurement was answered"
+    unavailable = {
+        "latency_us": unanswered,
+        "age_us": None if age else "the log has no status of the controller with an age",
+        "timing.period": None if "period" in spreads else "fewer than two measurements",
+        "timing.latency": unanswered,
+        "clock_offset_us": None if known else "too few ticks have all four times of sending and receiving",
+    }
+    reasons = {key: LOCKSTEP if loop.lockstep else why for key, why in unavailable.items() if why}
+    if part is not None:
+        reasons["duration_s"] = f"of the session only what is {_in_words(part)} was read"
+    merits = figures(
+        settings.wire,
+        loop.period,
+        (ticks.k, ticks.attitude_error),
+        (judged.answered, judged.voltages),
+        watchdog_s=settings.plant.watchdog_s,
+        unsent=judged.unsent,
+        latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
+        log=recording.name,
+        trips=seen.happened.trips,
+        reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
+        damages=[
+            *recording.unread,
+            *(f"malformed: {count} of {topic}" for topic, count in sorted(messages.malformed.items())),
+        ],
     )
-    findings = findings_of(figures, which, judged, events, run)
-    return Review(figures, findings, judged, which, name_of(paths), facts_of(run, events, which))
+    description = session.descriptions.get("controller")
+    certificate = description.certificate if description else None
+    theorem = check_theorem(settings, ticks, messages.truths, session.changes, certificate, faults=bool(seen.faults))
+    gap_count, longest = gaps(judged.answered, loop.period)
+    saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
+    missing = [gap for gap in recording.missing if gap.vehicle == vehicle]
+    unseen: list[Missing | Unknown] = [*(gap for gap in session.missing if gap.rows), *session.unknown]
+    if part is not None:
+        since, until = part[0] / loop.period, part[1] / loop.period
+        unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
+    started_s = ticks.wall_ns[:1] * 1e-9
+    findings = Findings(
+        **{key: getattr(merits, key) for key in Figures.model_fields if key != "reasons"},
+        reasons=merits.reasons | reasons | theorem.reasons,
+        vehicle=vehicle,
+        session=name,
+        sessions=len(recording.sessions_of(vehicle)),
+        recorded=[
+            Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
+            for (owner, one), extent in recording.extents.items()
+        ],
+        disagreements=disagreements(session.descriptions),
+        started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
+        timing=spreads,
+        clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if known else None,
+        age_us=age,
+        gaps=longest,
+        gap_count=gap_count,
+        saturated=saturated,
+        invalid=invalid,
+        losses=seen.happened.losses,
+        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
+        missing=missing,
+        unknown=session.unknown,
+        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
+        lapses=seen.lapses,
+        theorem=theorem.findings,
+        marks=seen.happened.marks,
+        faults=seen.faults,
+    )
+    return merits, findings, theorem
+
+
+def _in_words(part: tuple[float, float]) -> str:
+    since, until = max(0.0, part[0]), part[1]
+    return f"from {since:g} s on" if until == inf else f"from {since:g} s to {until:g} s"
+
+
+def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
+    """Keys of the loop, the wire and the plant in which the two ends' configurations differ."""
+    if not {"controller", "plant"} <= described.keys():
+        return []
+    tables = [flat(described[role].config) for role in ("controller", "plant")]
+    keys = sorted(set().union(*tables))
+    return [
+        Disagreement(key=key, controller=values[0], plant=values[1])
+        for key in keys
+        if key.startswith(("loop.", "wire.", "plant.")) and not key.startswith(OWN_AFFAIRS)
+        if (values := [table.get(key) for table in tables])[0] != values[1]
+    ]

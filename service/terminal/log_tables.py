@@ -141,6 +141,8 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
         yield "", f"… and {more} more keys; --json has them all"
+    if (part := findings.reasons.get("duration_s")) is not None:
+        yield "part", part
     yield "session", f"{findings.session} of {findings.vehicle}, {_utc(findings.started)}"
     vehicles = dict.fromkeys(one.vehicle for one in findings.recorded)
     if len(vehicles) > 1:
@@ -312,6 +314,9 @@ def replay_table(replay: Replay) -> None:
                 f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
                 f"logged, {other.computed} computed"
             )
+    for end_name, lines in replay.details.items():
+        for line in lines:
+            console.print(f"{end_name}: {line}", markup=False, soft_wrap=True)
     ends: dict[End, EndReplay | None] = {"controller": replay.controller, "plant": replay.plant}
     for name, end in ends.items():
         if end is None:

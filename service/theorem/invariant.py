@@ -22,10 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import asin, cos, hypot, isfinite, pi, sin, sqrt, tan
+from math import asin, cos, hypot, inf, isfinite, pi, sin, sqrt, tan
 from typing import Final
 
+import numpy as np
+
 from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.service.theorem.lemma import Coordinates, Floats, norm
 from aeroloop.service.theorem.linear import gains_of
 
 _MOST_ITERATIONS: Final = 300
@@ -180,6 +183,25 @@ def largest_start(p: Premises) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if reach(p, middle) is not None else (low, middle)
     return low
+
+
+def distance(p: Premises, c: Coordinates, sign: Floats, theta_error: Floats, desired_rate: Floats) -> Floats:
+    """‖x‖ at n instants, or a bound of it where the roll is held.
+
+    Args:
+        p: Premises.
+        c: The error coordinates.
+        sign: ±1, the equilibrium approached. Shape (n,).
+        theta_error: θ̃ [N·m·s/rad]. Shape (n, 3).
+        desired_rate: ω_d in the desired body frame [rad/s]. Shape (n, 3).
+    """
+    eps, C1, C2 = sign[:, None] * c.eps_e, np.array(p.C1), np.array(p.C2)
+    if p.tilt is None:
+        balance = -desired_rate * theta_error / (1 + C1 * C2)
+        return norm(np.hstack([eps - balance, c.z2 - C1 * balance]))
+    farthest = reach(p, largest_start(p))
+    shift = max(hypot(1, c1) / (1 + c1 * c2) for c1, c2, _ in p.axes)
+    return norm(np.hstack([eps, c.z2])) + (inf if farthest is None else shift * farthest.slow)
 
 
 def _disturbances(

@@ -43,11 +43,6 @@ class Decay(NamedTuple):
     delta_eps: float
     delta_omega: float
 
-    def counts_on(self, delta_eps: float, delta_omega: float) -> bool:
-        """Whether a measurement's errors are within those."""
-        errors = (delta_eps, self.delta_eps), (delta_omega, self.delta_omega)
-        return all(error <= most * (1 + 1e-9) + 1e-12 for error, most in errors)
-
 
 def decay(e: Evaluated, seen: float) -> Decay | None:
     """k and δ of the configured plant while ‖z^Q‖ ≤ `seen` at every tick; None where V need not decrease.

@@ -16,7 +16,6 @@ import pytest
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.service.cli.main import execute
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.hil_log import RunFigures
@@ -116,9 +115,7 @@ def test_an_export_has_a_row_a_tick(run: Run, tmp_path: Path) -> None:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     ticks = [int(row["tick"]) for row in rows]
     assert ticks == sorted(set(ticks))
-    blocks: list[Ticks] = []
-    read(run.log.path, watch=blocks.append)
-    assert ticks == [k for block in blocks for k in block.k.tolist()]
+    assert ticks == read(run.log.path).ticks.k.tolist()
     assert len(ticks) > 0.5 * RATE * run.figures.duration_s
 
 

@@ -19,7 +19,6 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Telemetry, Truth
 from aeroloop.protocol.messages.operator import Setpoint
 from aeroloop.protocol.wire.attitude import to_euler
-from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil import Hil
 from tests.hil.test_faults import PATIENT
@@ -64,13 +63,8 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     roll, pitch, yaw = (degrees(angle) for angle in to_euler(last.desired))
     assert (roll, pitch, yaw) == pytest.approx((0.0, -10.0, 20.0), abs=1e-6)  # quintics and quaternions, rounded
     # The review computes the errors again from frames and changes; the controller published what it had computed.
-    blocks: list[Ticks] = []
-    read(log.path, watch=blocks.append)
-    computed = {
-        k: tuple(error)
-        for block in blocks
-        for k, error in zip(block.k.tolist(), block.attitude_error.tolist(), strict=True)
-    }
+    ticks = read(log.path).ticks
+    computed = dict(zip(ticks.k.tolist(), map(tuple, ticks.attitude_error.tolist()), strict=True))
     published = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
     compared = [(message.attitude_error, computed[message.tick]) for message in published if message.tick in computed]
     assert len(compared) > 500

@@ -24,8 +24,8 @@ from aeroloop.protocol.messages.models import Event, Truth
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.host.operator import gather
-from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.mcap_file import records
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.review.review import review
 from aeroloop.service.testing.hil import HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous

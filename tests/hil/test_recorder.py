@@ -20,7 +20,7 @@ import pytest
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.topics import key
 from aeroloop.service.config import Settings, load
-from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, review
@@ -59,7 +59,7 @@ def test_a_rotated_run_in_lockstep_holds_every_tick_and_is_reviewed_and_replayed
     with Hil(tmp_path, lockstep=True) as hil:
         hil.start(settings={"recorder.max_file_s": 0.5, "recorder.chunk_s": 0.1})
         hil.run(20.0)
-    files = LogFiles([tmp_path]).paths
+    files = Recording([tmp_path]).paths
     assert len(files) >= 2
     found = assert_whole(tmp_path, 10_000)
     assert (found.skipped_ticks, found.duration_s) == (0, 20.0)

@@ -15,8 +15,8 @@ from aeroloop.service.config import ConfigError, Settings, load, load_over, with
 from aeroloop.service.lab.cells import Cell, run_cell
 from aeroloop.service.lab.experiment import experiment, run_experiment
 from aeroloop.service.logs.export import export
+from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import SessionReplay, replay
-from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.review import read, review
 from aeroloop.service.theorem.certificate import Certificate, certify
 from tests.support.certified import certified_settings
@@ -137,14 +137,14 @@ def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, 
         settings.wire,
         settings.wire.voltage.quantizer(),
     )
-    (block,) = Run([log]).read([("aero", "s1")])
-    sent = [wire.command.unpack(frame.tobytes()) for frame in block.controller["command"]]
+    rows = Recording([log]).session(("aero", "s1")).controller
+    sent = [wire.command.unpack(frame.tobytes()) for frame in rows["command"]]
     codes = [frame[1] for frame in sent if frame is not None]
     assert len(codes) == 200
     for i, name in enumerate(("voltage_2", "voltage_3")):
         assert table[f"{name}_V"] == [quantizer.level(both[i]) for both in codes]
         assert table[f"saturated_{name}"] == [abs(both[i]) == 31 for both in codes]
-    seen = [wire.measurement.unpack(frame.tobytes()) for frame in block.controller["measurement"]]
+    seen = [wire.measurement.unpack(frame.tobytes()) for frame in rows["measurement"]]
     level = wire.rate.quantizer().level
     assert table["rate_z_rad_s"] == [level(frame[1][5]) for frame in seen if frame is not None]
 

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from threading import Event, Thread
 
+import numpy as np
+
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
+from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.figures import Figures, Score
+from aeroloop.service.figures import Figures, figures
 
 PATIENCE_S = 20.0
 
@@ -24,7 +27,8 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
     """Run the closed loop for `duration_s` of the law's time [s]. The settings must say lockstep."""
     loop, wire = settings.loop, settings.wire
     controller = Controller(wire, settings.law, settings.reference, loop.period)
-    score = Score(wire, loop.period, settings.plant.watchdog_s)
+    errors, commands = list[Vector](), list[list[float]]()
+    silent = [0, 0]  # measurements and commands without a frame
     level = wire.voltage.quantizer().level
     voltages: list[float] = []
     over = Event()
@@ -51,12 +55,17 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
                 voltages = [level(code) for code in read[1]]
             else:
                 assert command == UNCHANGED
-            score.error(k, controller.attitude_error, sent=arrival.frame != UNCHANGED)
-            score.command(k, voltages, sent=command != UNCHANGED)
+            errors.append(controller.attitude_error)
+            commands.append(voltages)
+            silent[0] += arrival.frame == UNCHANGED
+            silent[1] += command == UNCHANGED
             link.send(command)
     finally:
         over.set()
         for thread in threads:
             thread.join()
         link.close()
-    return score.figures()
+    ticks = np.arange(len(errors))
+    return figures(
+        wire, loop.period, (ticks, np.array(errors)), (ticks, np.array(commands)), unsent=(silent[0], silent[1])
+    )

@@ -1,6 +1,6 @@
 """Edited logs: a copy of a log with messages moved, replaced, dropped or added, or rows of batches edited.
 
-Also builds synthetic ticks for an observer.
+Also builds ticks by hand.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -18,16 +19,12 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Message as Model
 from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batch
-from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
-from aeroloop.service.config import load
+from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.certified_bounds import certified_bounds
-from aeroloop.service.review.observe import WHOLE, DrawnPart, Observer
-from aeroloop.service.review.theorem_check import TheoremCheck
 from tests.support.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
-LATENCY_NS = 2 * ONE_WAY_NS  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
+LATENCY_NS = 2 * ONE_WAY_NS
 
 
 class Said(NamedTuple):
@@ -121,32 +118,15 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
     return change
 
 
-def observer_of(*overrides: str, part: DrawnPart = WHOLE) -> Observer:
-    """An observer of the default configuration."""
-    settings = load(overrides=overrides)
-    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings), part)
-
-
-def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:
-    """One tick at rest."""
-    at, zero, one = START_NS + k * PERIOD_NS, (0.0,) * 3, float(LATENCY_NS)
-    columns = (
-        k,
-        at,
-        at,
-        one,
-        nan,
-        nan,
-        attitude,
-        desired,
-        zero,
-        zero,
-        zero,
-        zero,
-        (0.0, 0.0),
-        (0.0, 0.0),
-        (0.0,) * 9,
-        (0.0, 0.0, 0.0, 1.0),
-        (0.0, 0.0, 0.0, 1.0),
-    )
-    return Ticks(*(np.array([column]) for column in columns))
+def at_rest(k: Sequence[int] | npt.NDArray[np.int64], **columns: Any) -> Ticks:
+    """Ticks of the default configuration at rest, where the body shall be; `columns` are others, by name."""
+    k = np.asarray(k, dtype=np.int64)
+    n, at_ns = len(k), START_NS + k * PERIOD_NS
+    upright, zeros, unknown = np.tile(IDENTITY, (n, 1)), np.zeros((n, 3)), np.full(n, nan)
+    state = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))  # θ̂, and the sign
+    volts = np.zeros((n, 2))
+    ticks = Ticks(
+        k, at_ns, at_ns, np.full(n, float(LATENCY_NS)), unknown, unknown, upright, upright, zeros, zeros, zeros,
+        volts, volts, np.full((n, 9), 0.3), state, state,
+    )  # fmt: skip
+    return ticks._replace(**columns)

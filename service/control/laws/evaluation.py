@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.protocol.wire.expressions import as_written
-from aeroloop.service.control.columns import along_rows, in_columns
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, Now, PythonLaw
 
 
@@ -45,78 +44,6 @@ def law_function(law: ExpressionLaw[Any]) -> ca.Function:
     Raises:
         ValueError: The law gives another number of voltages, or another state than its first one.
     """
-    parts = _parts(law)
-    given = {name: ca.SX.sym(name, parts.sizes[name]) for name in INPUTS}
-    last, state, gains, eps, *motion = given.values()
-    with as_written():
-        q = parts.attitude(last, eps)
-        e, omega_e = parts.errors(q, *motion[:3])
-        seen = q, *motion, e, omega_e, gains
-        return ca.Function(
-            "law",
-            [*given.values()],
-            [q, parts.voltages(state, *seen), parts.state(state, *seen), e[0], e[1:4], omega_e],
-            [*given],
-            ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
-            {"cse": True},  # the parts overlap, and a law may compute the errors once more, as the paper has them
-        )
-
-
-def law_of_many(law: ExpressionLaw[Any], rows: int) -> ca.Function:
-    """Many consecutive ticks of a law of expressions, for readers of logs. Raises as `law_function` does.
-
-    Attitude and state go from row to row; all else is computed in columns (service/control/columns.py).
-
-    Args:
-        law: The law.
-        rows: How many ticks; a multiple of `aeroloop.service.control.columns.UNROLLED`.
-
-    Returns:
-        A function with the inputs of `law_function`: `last` and `state` are those before the first tick, all others
-        have a row per tick. Its outputs: q, u, state_next, eps_e, omega_e, and state_used, from which u was computed.
-    """
-    parts = _parts(law)
-    given = {
-        name: ca.MX.sym(name, *((n, 1) if name in ("last", "state") else (rows, n))) for name, n in parts.sizes.items()
-    }
-    last, first, gains, eps, *motion = (given[name] for name in INPUTS)
-    q = along_rows(parts.attitude, last, eps)
-    e, omega_e = in_columns(parts.errors, rows)(q, *motion[:3])
-    seen = q, *motion, e, omega_e, gains
-    after = along_rows(parts.state, first, *seen) if parts.sizes["state"] else ca.MX(rows, 0)
-    state = ca.vertcat(first.T, after[:-1, :]) if parts.sizes["state"] else ca.MX(rows, 0)
-    u = in_columns(parts.voltages, rows)(state, *seen)
-    return ca.Function(
-        "law_of_many",
-        [given[name] for name in INPUTS],
-        [q, u, after, e[:, 1:4], omega_e, state],
-        list(INPUTS),
-        ["q", "u", "state_next", "eps_e", "omega_e", "state_used"],
-    )
-
-
-INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
-
-
-class _Parts(NamedTuple):
-    """A tick in parts.
-
-    Attributes:
-        attitude: last, eps ↦ q.
-        errors: q, omega, q_d, omega_d ↦ e, omega_e.
-        state: state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gains ↦ state after.
-        voltages: The same ↦ u.
-        sizes: Of INPUTS, by name.
-    """
-
-    attitude: ca.Function
-    errors: ca.Function
-    state: ca.Function
-    voltages: ca.Function
-    sizes: dict[str, int]
-
-
-def _parts(law: ExpressionLaw[Any]) -> _Parts:
     states = {name: len(value) for name, value in law.initial().items()}
     gain_sizes = {name: len(value) for name, value in configured_gains(law).items()}
     sizes = dict(zip(INPUTS, (4, sum(states.values()), sum(gain_sizes.values()), 3, 3, 4, 3, 3), strict=True))
@@ -131,14 +58,29 @@ def _parts(law: ExpressionLaw[Any]) -> _Parts:
         raise ValueError(f"its state after a tick is not that of `initial`: {', '.join(states) or 'none'}")
     state_after = ca.densify(ca.vertcat(ca.SX(0, 1), *(found[name] for name in states)))
     seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gains]
-    errors = list(tracking_errors(q, omega, q_d, omega_d))
-    return _Parts(
-        ca.Function("attitude", [last, eps], [received(eps, last)], ["last", "eps"], ["q"]),
-        ca.Function("errors", [q, omega, q_d, omega_d], errors, {"cse": True}),
-        ca.Function("state", seen, [state_after], {"cse": True}),
-        ca.Function("voltages", seen, [u], {"cse": True}),
-        sizes,
+    of_attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
+    of_errors = ca.Function(
+        "errors", [q, omega, q_d, omega_d], list(tracking_errors(q, omega, q_d, omega_d)), {"cse": True}
     )
+    of_state = ca.Function("state", seen, [state_after], {"cse": True})
+    of_voltages = ca.Function("voltages", seen, [u], {"cse": True})
+    given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
+    last, state, gains, eps, *motion = given.values()
+    with as_written():
+        q = of_attitude(last, eps)
+        e, omega_e = of_errors(q, *motion[:3])
+        inputs = state, q, *motion, e, omega_e, gains
+        return ca.Function(
+            "law",
+            [*given.values()],
+            [q, of_voltages(*inputs), of_state(*inputs), e[0], e[1:4], omega_e],
+            [*given],
+            ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
+            {"cse": True},  # the parts overlap, and a law may compute the errors once more, as the paper has them
+        )
+
+
+INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
 
 
 def check_voltages(law: Law[Any], voltages: int) -> None:

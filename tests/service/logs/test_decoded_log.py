@@ -12,10 +12,9 @@ from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
 from aeroloop.service.config import load
-from aeroloop.service.logs.export import export
-from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.export import ExportError, export
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
-from aeroloop.service.logs.table_files import ExportError
+from aeroloop.service.logs.recording import Recording
 from aeroloop.service.review.review import review
 from aeroloop.service.viewers.channels import Decoder
 from tests.support.edited_log import Said, write_messages
@@ -47,7 +46,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     log = tmp_path / "log.mcap"
     make_log(log, TICKS, settings=load())
     raw, rng = read(log), random.Random(3)
-    files = LogFiles([log])
+    files = Recording([log])
     decoder = Decoder(rate_hz=10)
     for description in files.descriptions.values():
         decoder.configure(description)
@@ -71,7 +70,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     )
     for name in ("measurement", "pose", "command"):
         assert len([m for m in found if m.topic == f"/{VEHICLE}/{name}"]) == TICKS
-    assert LogFiles([tmp_path / "out.mcap"]).descriptions == files.descriptions
+    assert Recording([tmp_path / "out.mcap"]).descriptions == files.descriptions
     assert review(tmp_path / "out.mcap").z_track == review(log).z_track
     with pytest.raises(ExportError, match="--session"):
         export([log], "mcap", tmp_path / "other.mcap", session=SESSION)
@@ -80,7 +79,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
 def test_what_several_files_repeat_is_written_once_and_the_last_description_stays_the_last(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     make_log(log, 50)
-    description = next(iter(LogFiles([log]).descriptions.values()))
+    description = next(iter(Recording([log]).descriptions.values()))
     before, now = (description.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
     (tmp_path / "run").mkdir()
     for i, descriptions in enumerate([(now, before), (before, now), (now,)]):

@@ -20,16 +20,11 @@ from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.files import LogFiles, ReviewError
 from aeroloop.service.logs.outputs import OutputError
-from aeroloop.service.logs.runs import Run
-from aeroloop.service.logs.table import Rows, TruthColumns, euler_deg, groups
-from aeroloop.service.logs.table_files import ArrowFile
+from aeroloop.service.logs.recording import Recording, ReviewError
+from aeroloop.service.logs.table import Rows, TruthColumns, columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.panels import columns_of
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
@@ -119,7 +114,7 @@ def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: 
 def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
     """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
     published = {}
-    for found in LogFiles([log]).routed(lambda address: address if address.topic.name == "telemetry" else None):
+    for found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
         telemetry = Telemetry.model_validate_json(found.data)
         if telemetry.session == SESSION:
             published[telemetry.tick] = telemetry
@@ -144,11 +139,11 @@ def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, set
     assert wire.voltage.bits is not None
     top = 2 ** (wire.voltage.bits - 1) - 1
     codes = {}
-    for block in Run([log]).read([(VEHICLE, SESSION)]):
-        for k, frame in zip(block.controller["tick"].tolist(), block.controller["command"], strict=True):
-            read = wire.command.unpack(frame.tobytes())
-            assert read is not None
-            codes[k] = read[1]
+    recorded = Recording([log]).session((VEHICLE, SESSION)).controller
+    for k, frame in zip(recorded["tick"].tolist(), recorded["command"].tolist(), strict=True):
+        read = wire.command.unpack(frame)
+        assert read is not None
+        codes[k] = read[1]
     for motor in (0, 1):
         found = dict(zip(parquet["tick"], parquet[f"saturated_voltage_{motor + 2}"], strict=True))
         assert {k: flag for k, flag in found.items() if flag is not None} == {
@@ -168,14 +163,10 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
-    law = attitude, attitude, rate, zeros, zeros, zeros, volts, volts, zeros, zeros, zeros
+    law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
     rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros))
-    found = {
-        column.name: list(values)
-        for group in groups(wire, 0.002, law_of(AdaptiveSettings(), 0.002, 3))
-        for column, values in zip(group.columns, group.of(rows).T, strict=True)
-        if column.name.startswith("saturated")
-    }
+    columns = columns_of(rows, load().model_copy(update={"wire": wire}))
+    found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
     np.testing.assert_equal(
         found,
         {
@@ -279,18 +270,12 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
             ticks(session)
 
 
-def test_the_table_does_not_depend_on_how_it_is_cut_into_blocks(
+def test_the_table_does_not_depend_on_how_many_rows_are_written_at_a_time(
     log: Path, tmp_path: Path, parquet: Table, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But for the delays, whose clocks are fitted block by block."""
-    fitted = {"measurement_delay_us", "command_delay_us"}
-    for size in (5, 64):
-        monkeypatch.setattr(Run.read, "__defaults__", (lambda _: None, size))
-        export([log], "parquet", tmp_path / f"{size}.parquet")
-        table = pyarrow.parquet.read_table(tmp_path / f"{size}.parquet").to_pydict()
-        assert {name: column for name, column in table.items() if name not in fitted} == {
-            name: column for name, column in parquet.items() if name not in fitted
-        }
+    monkeypatch.setattr("aeroloop.service.logs.export.AT_A_TIME", 64)
+    export([log], "parquet", tmp_path / "64.parquet")
+    assert pyarrow.parquet.read_table(tmp_path / "64.parquet").to_pydict() == parquet
 
 
 def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behind(
@@ -315,7 +300,7 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(ArrowFile, "write", full)
+    monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_batch", full)
     with pytest.raises(OutputError, match="No space left"):
         export([log], "parquet", tmp_path / "a.parquet")
     assert sorted(tmp_path.iterdir()) == before
@@ -332,13 +317,11 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
 
 
 @pytest.mark.parametrize(("actuators", "numbers"), [(1, "1"), (2, "23"), (3, "123"), (8, "12345678")])
-def test_the_table_and_the_review_have_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
-    wire = WireSpec(actuators=actuators)
-    names = {
-        column.name
-        for group in groups(wire, 0.002, law_of(AdaptiveSettings(), 0.002, actuators))
-        for column in group.columns
-    }
+def test_the_table_has_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
+    settings = load().model_copy(update={"wire": WireSpec(actuators=actuators)})
+    one, volts, q = np.ones(1), np.ones((1, actuators)), np.ones((1, 4))
+    law = q, q, q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
+    k = np.arange(1)
+    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts))
+    names = {column.name for column in columns_of(rows, settings)}
     assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}
-    drawn = [column.label for column in columns_of(load().model_copy(update={"wire": wire})) if column.group == "input"]
-    assert drawn == [f"u{'₁₂₃₄₅₆₇₈'[int(i) - 1]}" for i in numbers]

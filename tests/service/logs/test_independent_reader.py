@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
@@ -29,6 +28,7 @@ from aeroloop.service.recording import rolling
 from aeroloop.service.review.review import review
 from aeroloop.service.settings import RecorderSettings
 from tests.support.made_log import make_log
+from tests.support.mcap_parts import with_a_damaged_chunk
 
 READERS = Path(__file__).parents[2] / "readers"
 INSTALL = "npm install --no-package-lock --prefix tests/readers"
@@ -106,21 +106,6 @@ def assert_all_read(reader: Reader, *paths: Path) -> None:
         assert mine
         assert theirs(output[str(path)]["stream"]) == mine
         assert theirs(output[str(path)]["index"]) == mine
-
-
-def with_a_damaged_chunk(whole: Path, out: Path) -> Path:
-    data = bytearray(whole.read_bytes())
-    chunks = []
-    at = 8
-    while at < len(data) - 8:
-        length = int.from_bytes(data[at + 1 : at + 9], "little")
-        if data[at] == Opcode.CHUNK:
-            chunks.append((at + 9, length))
-        at += 9 + length
-    start, length = chunks[len(chunks) // 2]
-    data[start + length // 2] ^= 0x55
-    out.write_bytes(data)
-    return out
 
 
 def test_a_recorded_log(reader: Reader, whole: Path) -> None:

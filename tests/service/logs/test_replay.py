@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import random
+import re
 from pathlib import Path
 
 import pytest
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
@@ -14,13 +13,13 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.service.config import load
 from aeroloop.service.figures import Figures, StreamFigures
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.logs.files import LogFiles, ReviewError
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import Said, rewrite, write_messages
 from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
+from tests.support.mcap_parts import with_a_damaged_chunk
 
 TICKS = 600
 
@@ -67,6 +66,13 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
         bytes.fromhex(text) for text in (session.first_difference.logged, session.first_difference.computed)
     )
     assert logged[-1] ^ computed[-1] == 0x10
+    signal, controller, plant = both.details["controller"]
+    volts = [signal.split()[i] for i in (1, 4)]
+    steps = abs(float(volts[0]) - float(volts[1])) / (48 / 63)  # (2·y_max)/(2^R − 1)
+    assert signal == f"u3: {volts[0]} V logged, {volts[1]} V computed, {steps:.0f} steps apart"
+    assert re.fullmatch(r"the controller held q = .*; damping_estimate = .*; command \[.*\] V", controller)
+    assert re.fullmatch(r"the plant held \[.*\] V at its tick 321", plant)
+    assert "details" not in both.model_dump()
 
 
 def test_a_real_machine_is_not_replayed_and_the_reason_is_reported(tmp_path: Path) -> None:
@@ -111,73 +117,15 @@ def test_the_figures_of_a_made_log_are_those_of_the_experiment(tmp_path: Path) -
     assert figures.damages == []
 
 
-# Broken files
-
-
-def test_a_file_cut_anywhere_gives_what_was_whole_before_the_cut_and_reports_it(tmp_path: Path) -> None:
-    """At 30 places, and at every byte of each chunk's end; a chunk of 20 messages is the unit of loss."""
-    whole = tmp_path / "a.mcap"
-    make_log(whole, TICKS, changes=AN_OPERATORS_WORDS)
-    data = whole.read_bytes()
-    ends = _chunks(data, whole)
-    rng = random.Random(1)
-    cut = tmp_path / "cut.mcap"
-    found = []
-    for size in sorted({*(rng.randrange(8, len(data)) for _ in range(30)), *(e + d for e in ends for d in (-1, 0, 1))}):
-        cut.write_bytes(data[:size])
-        if not any(end <= size for end in ends):
-            continue
-        both = replay([cut])
-        assert both.controller is not None
-        assert not both.differs
-        found.append(both.controller.ticks)
-        if size < ends[-1]:
-            assert LogFiles([cut]).damages[cut]
-    assert found == sorted(found)
-    assert found[-1] == TICKS
-
-
-def _chunks(data: bytes, path: Path) -> list[int]:
-    """Where each chunk ends."""
-    ends, at = [], 8
-    while at < len(data) - 8:
-        opcode, length = data[at], int.from_bytes(data[at + 1 : at + 9], "little")
-        at += 9 + length
-        if opcode == Opcode.CHUNK:
-            ends.append(at)
-    assert len(ends) > 3, path
-    return ends
-
-
 def test_a_damaged_chunk_is_stepped_over_and_what_it_held_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    make_log(path, TICKS, settings=load())
-    data = bytearray(path.read_bytes())
-    ends = _chunks(bytes(data), path)
-    data[(ends[2] + ends[1]) // 2] ^= 0xFF  # within the third chunk
-    path.write_bytes(data)
+    make_log(tmp_path / "a.mcap", TICKS, settings=load())
+    path = with_a_damaged_chunk(tmp_path / "a.mcap", tmp_path / "b.mcap", 2)
     judged = read(path)
     assert len(judged.figures.damages) == 1
     assert "a chunk" in judged.figures.damages[0]
     missing = judged.findings.missing_ticks
     assert min(missing.values()) > 0
-    both = replay([path])
-    assert both.controller == EndReplay(ticks=TICKS - missing["controller"], differ=0)
-
-
-def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path) -> None:
-    for content in (b"", b"something else", b"\x89MCAP0\r\n"):
-        (tmp_path / "a.mcap").write_bytes(content)
-        with pytest.raises(ReviewError) as refused:
-            review(tmp_path / "a.mcap")
-        assert len(str(refused.value).splitlines()) == 1
-    with pytest.raises(ReviewError, match=r"no \.mcap file"):
-        LogFiles([_empty(tmp_path)])
-
-
-def _empty(folder: Path) -> Path:
-    (folder / "empty").mkdir()
-    return folder / "empty"
+    assert replay([path]).controller == EndReplay(ticks=TICKS - missing["controller"], differ=0)
 
 
 def test_a_folder_is_read_as_one_run_in_the_order_of_time(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report
 from tests.support.edited_log import Said, rewrite
 from tests.support.made_log import SESSION, lockstep, make_log
+from tests.support.mcap_parts import chunks, with_a_damaged_chunk
 
 TICKS = 600
-CHUNK = 0x06
 
 
 @pytest.fixture(scope="module")
@@ -30,35 +30,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def chunks(data: bytes) -> list[tuple[int, int]]:
-    """Where each chunk begins and ends."""
-    found, at = [], 8
-    while at < len(data) - 8:
-        end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-        if data[at] == CHUNK:
-            found.append((at, end))
-        at = end
-    return found
-
-
 @pytest.fixture
 def cut(whole: Path, tmp_path: Path) -> Path:
     """As a recorder leaves it that is killed: cut within a chunk."""
     data = whole.read_bytes()
-    begin, end = chunks(data)[-4]
-    (tmp_path / "cut.mcap").write_bytes(data[: (begin + end) // 2])
+    chunk = chunks(data)[-4]
+    (tmp_path / "cut.mcap").write_bytes(data[: (chunk.offset + chunk.end) // 2])
     return tmp_path / "cut.mcap"
 
 
 @pytest.fixture
 def damaged(whole: Path, tmp_path: Path) -> Path:
     """With a chunk that cannot be read, with ticks of both ends."""
-    data = bytearray(whole.read_bytes())
-    places = chunks(bytes(data))
-    begin, end = places[len(places) // 2]
-    data[(begin + end) // 2] ^= 0xFF
-    (tmp_path / "damaged.mcap").write_bytes(data)
-    return tmp_path / "damaged.mcap"
+    return with_a_damaged_chunk(whole, tmp_path / "damaged.mcap")
 
 
 def without(end: str, gone: Callable[[Any], bool]) -> Callable[[Said], Said | None]:
@@ -97,7 +81,10 @@ def test_a_replay_of_a_cut_log_names_the_cut_and_fails(cut: Path, capsys: pytest
     assert verdict.code == 1
     for end in ("controller", "plant"):
         assert re.match(r"the same, byte for byte, at \d+ ticks; not compared: ", verdict.line(end))
-        assert re.search(rf"{cut}: the file is cut within a record of \d+ bytes \(byte \d+\)", verdict.line(end))
+        assert re.search(
+            rf"{cut}: the file is cut within a record of \d+ bytes \(byte \d+, after [-\d]+ [:\d]+ UTC\)",
+            verdict.line(end),
+        )
     assert "every tick" not in verdict.out
     found = json.loads(Verdict(capsys, "replay", cut, "--json").out)
     assert found["controller"]["ticks"] < TICKS

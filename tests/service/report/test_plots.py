@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.report import figure_style
 from aeroloop.service.report.figure_style import FORMATS
 from aeroloop.service.report.plots import draw_figures
@@ -100,7 +100,11 @@ def test_what_cannot_be_drawn_or_written_is_refused_in_one_line(
     (tmp_path / "file").write_text("")
     for arguments, status, line in (
         (["--figures", str(tmp_path / "file")], 1, f"cannot write into {tmp_path / 'file'}: File exists"),
-        (["--figures", str(tmp_path / "none"), "--from", "7"], 1, "nothing to draw after 7 s: the session has 0.4 s"),
+        (
+            ["--figures", str(tmp_path / "none"), "--from", "7"],
+            1,
+            "there is nothing from 7 s on: the session has 0.4 s",
+        ),
         (["--from", "2", "--to", "1"], 2, "--from 2 is not before --to 1"),
     ):
         assert execute(["log", "review", str(logs["quantized"]), *arguments]) == status

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import random
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import FaultStatus, Status
@@ -14,13 +14,11 @@ from aeroloop.service import examples
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.demo import DemoFigures
-from aeroloop.service.logs.runs import Block
 from aeroloop.service.report.page import judgement, page
-from aeroloop.service.review.faults import FaultLog
-from aeroloop.service.review.report import Band, FaultInterval, Findings
+from aeroloop.service.review.report import Band, FaultInterval
 from aeroloop.service.review.review import read
-from tests.support.edited_log import Said, rewrite
-from tests.support.made_log import make_log
+from tests.support.edited_log import edited, message_of, rewrite
+from tests.support.made_log import START_NS, make_log
 
 TICKS = 500
 CONFIGURED = ["command:drop=0.3@0.2..0.6", "rate:noise=0.001@0.8", "attitude:off@5"]
@@ -56,46 +54,28 @@ def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(fau
     ]  # fmt: skip
 
 
-def test_the_shipped_example_shows_its_dropped_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    example = Path(examples.__path__[0]) / "faults.toml"
-    make_log(tmp_path / "a.mcap", 1500, settings=load(example))
-    assert execute(["log", "review", str(tmp_path / "a.mcap")]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    dropped = read(tmp_path / "a.mcap").findings.lapses["withheld"]
-    assert 20 < dropped < 90  # a tenth of 500
-    assert f"with faults command:drop=0.1@2 from 2.000 s to the end, {dropped} commands dropped (configured)" in text
-
-
-def test_without_any_event_the_intervals_are_the_same(faulty: Path, tmp_path: Path) -> None:
-    def lost(message: Said) -> Said | None:
-        return None if message.topic == "event" else message
-
-    quiet = read(rewrite(faulty, tmp_path / "a.mcap", lost)).findings
-    assert [mark for mark in quiet.marks if mark.role == "plant"] == []
-    assert quiet.faults == read(faulty).findings.faults
-
-
-def test_events_have_the_same_times_as_the_intervals(faulty: Path) -> None:
+def test_events_have_the_same_times_as_the_intervals_which_need_no_event(faulty: Path, tmp_path: Path) -> None:
     findings = read(faulty).findings
     times = {mark.text.split(": ")[1].split(",")[0]: mark.time_s for mark in findings.marks if "begins" in mark.text}
     assert times == {fault.fault: fault.begin_s for fault in findings.faults}
+    without = rewrite(faulty, tmp_path / "a.mcap", lambda one: None if one.topic == "event" else one)
+    quiet = read(without).findings
+    assert [mark for mark in quiet.marks if mark.role == "plant"] == []
+    assert quiet.faults == findings.faults
 
 
-def test_the_verdict_and_the_bands_name_the_faults(faulty: Path) -> None:
+def test_the_verdict_the_bands_and_the_page_name_the_faults(faulty: Path) -> None:
     review = read(faulty)
-    found = judgement(review.findings)
+    found, made = judgement(review.findings), review.report()
     assert found.word == "Tracked, with faults"
     counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
     assert f"3 faults acted at the plant: {counts}." in found.because
-    assert list(review.report().bands) == [
+    assert list(made.bands) == [
         Band(0.2, 0.6, "command:drop=0.3@0.2..0.6"),
         Band(0.648, 0.898, "motor1:bias=0.5@0.05"),
         Band(0.8, 0.898, "rate:noise=0.001@0.8"),
     ]
-
-
-def test_the_page_has_each_fault_with_its_times_and_counts(faulty: Path) -> None:
-    html = page([read(faulty).report()])
+    html = page([made])
     row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
     for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):
         assert cell in row
@@ -108,28 +88,41 @@ def test_a_run_without_faults_or_with_faults_to_come_says_nothing_of_them(tmp_pa
     assert judgement(findings).word == "Tracked"
 
 
-def test_the_terminal_and_json_list_them(faulty: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert execute(["log", "review", str(faulty)]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    assert "with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s" in text
-    assert execute(["log", "review", "--json", str(faulty)]) == 0
-    findings = Findings.model_validate_json(capsys.readouterr().out)
-    assert [fault.source for fault in findings.faults] == ["configured", "injected", "configured"]
-
-
-def test_the_demos_summary_names_them_before_its_figures(
+def test_review_and_demo_list_them_first_in_the_terminal_and_as_json(
     faulty: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("aeroloop.service.lab.demo.run_demo", lambda *_: (DemoFigures.of([faulty]), True))
-    assert execute(["demo"]) == 0
+    for command in (["log", "review", str(faulty)], ["demo"]):
+        assert execute(command) == 0
+        text = " ".join(capsys.readouterr().out.split())
+        assert text.index("with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s") < text.index(" duration ")
+        assert execute([*command, "--json"]) == 0
+        faults = json.loads(capsys.readouterr().out)["faults"]
+        assert [fault["source"] for fault in faults] == ["configured", "injected", "configured"]
+
+
+def test_the_shipped_example_shows_its_dropped_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_log(tmp_path / "a.mcap", 1500, settings=load(Path(examples.__path__[0]) / "faults.toml"))
+    assert execute(["log", "review", str(tmp_path / "a.mcap")]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert text.startswith("with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s")
-    assert " duration " in text
-    assert execute(["demo", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["faults"]) == 3
+    dropped = read(tmp_path / "a.mcap").findings.lapses["withheld"]
+    assert 20 < dropped < 90  # a tenth of 500
+    assert f"with faults command:drop=0.1@2 from 2.000 s to the end, {dropped} commands dropped (configured)" in text
 
 
 # ── several sessions and processes ──
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of 50 ticks without a status, which begins at the plant's tick 100."""
+
+    def later(columns: Any) -> None:
+        columns["tick"] += 100
+
+    folder = tmp_path_factory.mktemp("quiet")
+    make_log(folder / "plain.mcap", 50, settings=load())
+    return rewrite(folder / "plain.mcap", folder / "quiet.mcap", edited("plant", later))
 
 
 def status(session: str | None, uptime_s: float, changed: int, end_tick: int | None = None) -> Status:
@@ -148,35 +141,27 @@ def status(session: str | None, uptime_s: float, changed: int, end_tick: int | N
     )
 
 
-def statuses_in_some_order(statuses: tuple[Status, ...]) -> list[tuple[int, Status]]:
-    """Statuses with their times of publication, as a recorder writes them that recovers some of them late."""
-    published = list(enumerate(statuses))
-    random.Random(len(statuses)).shuffle(published)
-    return published
+def intervals(quiet: Path, out: Path, *statuses: Status) -> list[FaultInterval]:
+    """Faults of the session, whose plant published these statuses in this order; a recorder wrote them in another."""
+    said = [message_of("status", one, START_NS + i, role="plant") for i, one in enumerate(statuses)]
+    random.Random(len(said)).shuffle(said)
+    more = [one._replace(recorded_ns=START_NS + 10**9 + i) for i, one in enumerate(said)]
+    return read(rewrite(quiet, out, more=more)).findings.faults
 
 
-def intervals(*statuses: Status, first: int = 100, ticks: int = 50) -> list[FaultInterval]:
-    log = FaultLog("s", 0.1)
-    for at_ns, one in statuses_in_some_order(statuses):
-        log.status(one, at_ns)
-    k = np.arange(ticks)
-    log.take(Block(("aero", "s"), k, {}, {"tick": first + k, "session_tick": k}, k, k, k, [], None))
-    return log.intervals()
-
-
-def test_of_a_fault_that_acts_in_several_sessions_only_this_ones_frames_count() -> None:
-    (found,) = intervals(
-        status("r", 1, 3), status(None, 2, 5), status("s", 3, 6), status(None, 4, 9), status("t", 5, 20)
-    )
+def test_of_a_fault_that_acts_in_several_sessions_only_this_ones_frames_count(quiet: Path, tmp_path: Path) -> None:
+    statuses = status("r", 1, 3), status(None, 2, 5), status("s1", 3, 6), status(None, 4, 9), status("t", 5, 20)
+    (found,) = intervals(quiet, tmp_path / "a.mcap", *statuses)
     assert (found.begin_s, found.end_s, found.changed) == (0.0, None, 9 - 5)
 
 
-def test_what_another_process_of_the_plant_counted_before_is_not_subtracted() -> None:
-    (found,) = intervals(status(None, 100, 50), status("s", 3, 6), status(None, 0.5, 0))
+def test_what_another_process_of_the_plant_counted_before_is_not_subtracted(quiet: Path, tmp_path: Path) -> None:
+    statuses = status(None, 100, 50), status("s1", 3, 6), status(None, 0.5, 0)
+    (found,) = intervals(quiet, tmp_path / "a.mcap", *statuses)
     assert found.changed == 6
 
 
-def test_a_fault_that_was_over_before_the_session_is_not_listed() -> None:
-    assert intervals(status("s", 3, 6, end_tick=100)) == []
-    (found,) = intervals(status("s", 3, 6, end_tick=101))
-    assert found.end_s == pytest.approx(0.1)
+def test_a_fault_that_was_over_before_the_session_is_not_listed(quiet: Path, tmp_path: Path) -> None:
+    assert intervals(quiet, tmp_path / "a.mcap", status("s1", 3, 6, end_tick=100)) == []
+    (found,) = intervals(quiet, tmp_path / "b.mcap", status("s1", 3, 6, end_tick=101))
+    assert found.end_s == pytest.approx(0.002)

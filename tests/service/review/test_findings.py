@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +12,17 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Loss
-from aeroloop.protocol.messages.trace import Outcome, Received, read_header
+from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read_header
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
-from aeroloop.service.review.report import Check, Findings, Mark, Spread
+from aeroloop.service.review.report import Check, Findings, Spread
 from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.review import read, report, review
+from aeroloop.service.review.review import read, review
 from aeroloop.service.terminal.log_tables import sparkline
+from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, lockstep, make_log
-
-TICKS = 500
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of 500 ticks in real time, each answered after 300 µs."""
-    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    make_log(path, TICKS, settings=load())
-    return path
 
 
 def found(path: Path) -> Findings:
@@ -143,20 +135,16 @@ def test_what_happened_hours_before_the_session_takes_a_few_lines_after_the_figu
     assert out.index("duration") < out.index("before")
 
 
-def test_what_a_restarted_recorder_received_again_counts_once(whole: Path, tmp_path: Path) -> None:
-    event = message_of("event", Event(role="plant", kind="tripped", text="tilted"), START_NS + 500_000_000)
-    findings = found(rewrite(whole, tmp_path / "a.mcap", more=[event, event]))
-    assert findings.trips == ["tilted"]
-    assert len([mark for mark in findings.marks if mark.kind == "tripped"]) == 1
-
-
-def test_a_trip_is_the_plant_s_by_the_key_of_its_event_whatever_an_event_claims_to_be(
+def test_a_trip_is_the_plants_by_the_key_of_its_event_and_counts_once_however_often_recorded(
     whole: Path, tmp_path: Path
 ) -> None:
-    forged = message_of("event", Event(role="plant", kind="tripped", text="never"), START_NS + 5 * 10**8, "recorder")
-    findings = found(rewrite(whole, tmp_path / "a.mcap", more=[forged]))
-    assert findings.trips == []
-    assert [mark.role for mark in findings.marks if mark.text == "never"] == ["recorder"]
+    trip, forged = (Event(role="plant", kind="tripped", text=text) for text in ("tilted", "never"))
+    once = message_of("event", trip, START_NS + 5 * 10**8)
+    more = [once, once, message_of("event", forged, START_NS + 5 * 10**8, "recorder")]
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
+    assert findings.trips == ["tilted"]
+    marks = [(mark.role, mark.text) for mark in findings.marks if mark.kind == "tripped"]
+    assert marks == [("plant", "tilted"), ("recorder", "never")]
 
 
 def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:
@@ -170,6 +158,29 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
     findings = found(rewrite(path, tmp_path / "b.mcap", edited("plant", stale)))
     assert findings.lapses == {"late": 2, "missed": 2, "stale": 1}
     assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
+
+
+def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_are(tmp_path: Path) -> None:
+    """A batch of the controller is not there; and none of the controller of another vehicle."""
+    others: list[Said] = []
+
+    def lacking(one: Said) -> Said | None:
+        if one.topic != "trace" or not one.key.endswith("controller"):
+            others.append(one._replace(key=one.key.replace("/aero/", "/beta/")))
+            return one
+        batch = read_batch(one.data)
+        return None if batch is not None and 200 in batch.columns["tick"] else one
+
+    make_log(tmp_path / "a.mcap", 1200, settings=load())
+    path = rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", lacking, others)
+    findings = read(path, vehicle="aero").findings
+    lacks = findings.missing_ticks["controller"]
+    assert 40 < lacks < 60
+    assert (findings.lapses, findings.missing_ticks["plant"], len(findings.missing)) == ({}, 0, 1)
+    for since_s, until_s, lines in ((-inf, inf, 1), (0.35, 0.8, 1), (0.6, inf, 0), (-inf, 0.2, 0)):
+        part = read(path, vehicle="aero", since_s=since_s, until_s=until_s).findings
+        assert len(part.unseen["missing_ticks"]) == lines
+        assert (Limit.parse("gaps=100").unseen(part, []) is None) == (lines == 0)
 
 
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
@@ -237,32 +248,18 @@ def test_findings_are_the_figures_and_more(whole: Path) -> None:
 def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
     facts = {"git": "abc", "cpu": "two cores"}
     path = rewrite(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
-    made = report([path], [Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
+    made = read(path).report([Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
     assert made.name == "night"
     assert made.settings["wire"]["voltage"]["bits"] == 6
     host = {"host": "h", "versions": {}}
     assert made.facts == {"controller": host, "plant": host, "recorder": facts}
     assert made.findings.checks == [
         Check(text="skipped ≤ 0", holds=True, found="0"),
-        Check(text="latency.p99 ≤ 100 µs", holds=False, found="297.9 µs"),
+        Check(text="latency.p99 ≤ 100 µs", holds=False, found="300 µs"),
     ]
 
 
-@pytest.mark.parametrize(
-    ("limit", "value"),
-    [
-        ("skipped=0", 3),
-        ("gaps=0", 2),
-        ("losses=0", 7),
-        ("latency.p99=0", 4.0),
-        ("period.p999=0", 5.0),
-        ("age.max=0", 3.0),
-        ("saturated.voltage=0", 0.25),
-        ("invalid=0", 9),
-        ("trips=0", 1),
-    ],
-)
-def test_short_names_of_limits_mean_what_they_say(whole: Path, limit: str, value: float) -> None:
+def test_short_names_of_limits_mean_what_they_say(whole: Path) -> None:
     clean = found(whole)
     timing = {
         "latency": clean.timing["latency"].model_copy(update={"p99": 4.0}),
@@ -275,7 +272,11 @@ def test_short_names_of_limits_mean_what_they_say(whole: Path, limit: str, value
             "invalid": {"measurement": 4, "command": 5},
         }
     )  # fmt: skip
-    assert Limit.parse(limit).value(findings) == value
+    values = {
+        "skipped": 3, "gaps": 2, "losses": 7, "latency.p99": 4.0, "period.p999": 5.0, "age.max": 3.0,
+        "saturated.voltage": 0.25, "invalid": 9, "trips": 1,
+    }  # fmt: skip
+    assert {name: Limit.parse(f"{name}=0").value(findings) for name in values} == values
 
 
 def test_a_missing_figure_breaks_its_limit_and_states_why(whole: Path) -> None:
@@ -284,35 +285,16 @@ def test_a_missing_figure_breaks_its_limit_and_states_why(whole: Path) -> None:
     assert "controller" in check.found
 
 
-KEYS = {
-    "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
-    "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
-    "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks", "missing_ticks",
-    "missing", "unseen", "clock_offset_us", "faults", "recorded", "disagreements", "second_half_error_deg",
-    "command_changes_per_s", "unknown",
-}  # fmt: skip
-THEOREM_KEYS = {
-    "verdict", "holds", "held", "radius", "pointwise_radius", "pointwise_deg", "mean_square_share", "mean_square_at_s",
-    "mean_square_judged", "spacing_s", "pointwise_share", "pointwise_at_s", "pointwise_judged", "pointwise_since_s",
-    "pointwise_bound", "transient_s", "since_s", "until_s", "z_norm", "error_deg", "true_z_norm", "true_error_deg",
-    "damping_known", "samples", "outside", "judged", "lemma", "broken",
-}  # fmt: skip
-
-
-def test_the_keys_of_the_json_are_stable_and_the_exit_code_reports_whether_limits_hold(
-    whole: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Which keys the JSON has is what the stored logs say (tests/golden)."""
     assert execute(["log", "review", str(whole), "--json", "--require", "z_track=50e-4", "--require", "skipped=0"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed.keys() == KEYS
     assert printed["timing"]["latency"].keys() == {"count", "p50", "p90", "p99", "p999", "max", "bins"}
-    assert printed["marks"][0].keys() == set(Mark.model_fields)
-    assert printed["theorem"].keys() == THEOREM_KEYS
     assert [check["holds"] for check in printed["checks"]] == [True, True]
     assert execute(["log", "review", str(whole), "--json", "--require", "latency.p50=1"]) == 1
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"][0]["holds"] is False
-    assert output.err == "aeroloop: latency.p50 is 297.9, more than 1\n"
+    assert output.err == "aeroloop: latency.p50 is 300, more than 1\n"
 
 
 def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:
@@ -338,7 +320,7 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     assert execute(["log", "review", str(path), "--require", "gaps=0"]) == 1
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
-    assert "latency 298 298 298 300 µs" in out
+    assert "latency 300 300 300 300 µs" in out
     assert out.startswith("0.410 s plant tripped the [red] limit 0.500 s")
     assert "plant refused no 0 refused (and 14 more like it, the last: 0.500 s)" in out
     assert "… and 4 more such events" in out  # beside what the session began with

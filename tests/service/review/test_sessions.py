@@ -15,10 +15,9 @@ from aeroloop.protocol.messages.operator import Gains
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
+from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.compare import Comparison, read_runs
 from aeroloop.service.review.review import read, report, review
 from tests.support.edited_log import message_of, rewrite
@@ -69,7 +68,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_longest_session_is_judged_unless_one_is_named_or_numbered(log: Path) -> None:
     def which(**chosen: Any) -> tuple[str, str]:
-        return read(log, **chosen).which
+        found = read(log, **chosen).findings
+        return found.vehicle, found.session
 
     assert which() == which(session="1") == which(session="s1") == (VEHICLE, "s1")
     assert which(session="2") == which(session="aero/s2") == which(session="s2", vehicle=VEHICLE) == (VEHICLE, "s2")
@@ -84,7 +84,7 @@ def test_a_session_is_judged_by_the_configuration_that_it_began_with(log: Path, 
     alone = {"1": load(), "2": load(overrides=["law.C2=[0.3, 0.3, 0.3]"])}
     for number, settings in alone.items():
         found = read(log, session=number)
-        assert found.session.settings.law == settings.law
+        assert found.settings.law == settings.law
         messages = made(settings, 200 if number == "1" else 100)
         assert found.figures.z_track == review(write(tmp_path / "a.mcap", settings, messages)).z_track
     replayed = replay([log])
@@ -148,7 +148,7 @@ def test_what_a_restarted_recorder_wrote_is_one_run(tmp_path: Path) -> None:
     parts = [recorded(tmp_path / f"{i}.mcap", messages[i::2], f"id{i}") for i in range(2)]
     assert review(*parts).z_track == review(recorded(tmp_path / "whole", messages, None)).z_track
     later = recorded(tmp_path / "later.mcap", made(load(), 100, session="s2", at_ns=HOUR_NS), "id1")
-    assert len(Run([later, *parts]).extents) == 2
+    assert len(Recording([later, *parts]).extents) == 2
 
 
 # Whose settings
@@ -186,27 +186,12 @@ def test_runs_differ_by_what_their_plants_were_and_not_by_addresses(tmp_path: Pa
     assert [one.key for one in Comparison.of(read_runs(runs)).differences] == ["plant.aero.mass"]
 
 
-def test_lockstep_has_no_durations_and_says_why(tmp_path: Path) -> None:
-    shown = report([write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))])
-    findings = shown.findings
-    assert (findings.latency_us, findings.timing, findings.age_us) == (None, {}, None)
-    for name in ("latency_us", "age_us", "timing.latency", "timing.period"):
-        assert "lockstep" in findings.reasons[name]
-    assert not {"latency", "period"} & {panel.group for panel in shown.panels}
+def test_in_lockstep_the_exported_durations_are_empty(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))
     export([tmp_path / "a.mcap"], "csv", tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row[name] for row in rows for name in ("latency_us", "measurement_delay_us", "command_delay_us")} == {""}
-
-
-def test_the_latency_is_that_of_the_session(tmp_path: Path) -> None:
-    """Not that of the plant's process since its start, as its status has it."""
-    findings = read(write(tmp_path / "a.mcap", load(), made(load(), 100))).findings
-    assert findings.latency_us is not None
-    assert (findings.latency_us.p50, findings.latency_us.count) == (
-        findings.timing["latency"].p50,
-        findings.timing["latency"].count,
-    )
 
 
 # What is said

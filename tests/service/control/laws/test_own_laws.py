@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from math import isnan
 from pathlib import Path
@@ -19,10 +18,8 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.lab.experiment import experiment, run_experiment
-from aeroloop.service.logs.batch import BatchController
 from tests.service.control.test_tick import frames
-from tests.service.logs.test_batch import TICKS, WIRES, Run
-from tests.support import failing_laws, own_laws
+from tests.support import failing_laws
 from tests.support.failing_laws import FAILING, Failure
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON
 
@@ -101,35 +98,6 @@ def test_a_state_that_is_not_the_laws_is_not_taken() -> None:
     assert one.law_state == {"sum": (0.0, 0.0, 0.0), "sign": (-1.0,)}
 
 
-# What reads logs
-
-
-class OwnRun(Run):
-    """Of a user's law, with changes of its gains."""
-
-    def __init__(self, kind: str, wire: str, seed: int) -> None:
-        super().__init__(wire, seed, f"law.kind={kind}")
-
-    def gains(self, rng: np.random.Generator) -> Gains:
-        if not self.controller(Controller, None).gains.named:
-            return Gains()
-        return Gains(kp=rng.uniform(0, 20), kd=rng.uniform(0, 9, 3).tolist() if rng.random() < 0.5 else None)
-
-
-@settings(max_examples=12)
-@given(
-    kind=st.sampled_from([EXPRESSIONS, PYTHON, f"{HERE}:Bare", f"{HERE}:BarePython"]),
-    wire=st.sampled_from(sorted(WIRES)),
-    seed=st.integers(0, 2**32 - 1),
-    cuts=st.lists(st.integers(0, TICKS), max_size=3).map(sorted),
-    restored=st.lists(st.booleans(), min_size=3, max_size=3),
-)
-def test_blocks_have_the_bits_of_the_loop_with_any_law(
-    kind: str, wire: str, seed: int, cuts: list[int], restored: list[bool]
-) -> None:
-    OwnRun(kind, wire, seed).check(cuts, restored)
-
-
 # Experiments
 
 
@@ -185,21 +153,3 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     assert one.fault is not None
     assert WHY[failure].format(line=line) in one.fault
     assert len(one.fault.splitlines()) == 1
-
-
-def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A law that hung once hangs whenever it is run: a reader of its log needs the errors, and no voltages."""
-    settings = load(overrides=[f"law.kind={PYTHON}"])
-    given = settings.wire, settings.law, settings.reference, settings.loop.period
-    loop, beside = BatchController(*given), BatchController(*given)
-    k, codes = np.arange(5), np.full((5, 6), 3.0)
-    whole = loop.compute_all(k, codes, deque())
-
-    runs = list[object]()
-    monkeypatch.setattr(own_laws.Python, "step", lambda *_: runs.append(None))
-    beside.follow(BatchController(*given))
-    found = beside.compute_all(k, codes, deque())
-    assert not runs
-    assert np.isnan(found.voltages).all()
-    for name in ("attitude", "desired", "rate", "attitude_error", "rate_error"):
-        assert (getattr(found, name) == getattr(whole, name)).all()

@@ -1,0 +1,209 @@
+"""Ticks of a log: decoded frames by frames, recomputed columns by the loop's own telemetry, and by SPEC.md alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.models import Telemetry
+from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.config import load
+from aeroloop.service.control.laws.evaluation import initial_state
+from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.daemon.tick_source import PlantTick
+from aeroloop.service.logs import recording as recording_module
+from aeroloop.service.logs.recording import Recording, ReviewError
+from aeroloop.service.logs.replay import EndReplay, replay
+from aeroloop.service.logs.ticks import Ticks, codes_in, levels, recompute
+from aeroloop.service.review.review import review
+from tests.golden.make import HERE as GOLDEN
+from tests.support import own_laws
+from tests.support.made_log import (
+    AN_OPERATORS_WORDS,
+    RUNS,
+    SESSION,
+    VEHICLE,
+    Clock,
+    ControllerEnd,
+    Messages,
+    make_log,
+    write,
+)
+from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON
+
+CONTINUOUS = [f"wire.{signal}.bits=cont" for signal in ("attitude", "rate", "voltage")]
+ON_CHANGE = "wire.transmit=on_change"
+WIRES = {
+    "default": [],
+    "coarse": ["wire.attitude.bits=2", "wire.rate.bits=3", "wire.voltage.bits=2", ON_CHANGE],
+    "continuous": CONTINUOUS,
+    "mixed": ["wire.attitude.bits=cont", "wire.rate.bits=16", "wire.rate.deadzone=0.01", ON_CHANGE],
+    "hysteresis": [f"wire.{signal}.kind=hysteresis-uniform" for signal in ("attitude", "rate", "voltage")],
+    "rigid body": ["wire.actuators=3", "plant.kind=rigid_body", "plant.ideal=true", ON_CHANGE],
+}
+
+
+def bits(values: Any) -> list[int]:
+    """Doubles as integers: NaN equals itself, and −0 is not 0."""
+    found: list[int] = np.asarray(values, dtype=np.float64).ravel().view(np.int64).tolist()
+    return found
+
+
+@given(
+    widths=st.lists(st.none() | st.integers(2, 16), min_size=1, max_size=7),
+    counter_bits=st.integers(4, 16),
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(0, 40),
+)
+def test_many_frames_are_read_as_each(widths: list[int | None], counter_bits: int, seed: int, n: int) -> None:
+    kind, rng = FrameFormat(widths, counter_bits), np.random.default_rng(seed)
+    floats = [float("nan"), -0.0, 5e-324, -1.7e308, *rng.normal(size=10)]
+    rows = [
+        [
+            float(rng.choice(floats)) if width is None else int(rng.integers(-(2 ** (width - 1)), 2 ** (width - 1)))
+            for width in widths
+        ]
+        for _ in range(n)
+    ]
+    table = np.zeros(n, dtype=[("tick", "<u4"), ("frame", f"V{kind.size}")])
+    table["frame"] = np.array([kind.pack(i % kind.counters, row) for i, row in enumerate(rows)], f"V{kind.size}")
+    codes = codes_in(kind, table["frame"])
+    assert codes.shape == (n, len(widths))
+    assert bits(codes) == bits(rows)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "hysteresis-uniform", "logarithmic-uniform"])
+@pytest.mark.parametrize("width", [3, 6, 16])
+def test_the_level_of_every_code_is_the_quantizers(kind: Any, width: int) -> None:
+    signal = SignalSpec(bits=width, limit=24.0, kind=kind)
+    codes = np.arange(-(2 ** (width - 1)), 2 ** (width - 1), dtype=np.int16)
+    assert bits(levels(signal, codes)) == bits(list(map(signal.quantizer().level, codes.tolist())))
+
+
+@pytest.mark.parametrize(
+    ("kind", "wire"),
+    [
+        *((kind, wire) for kind in ("adaptive", EXPRESSIONS, PYTHON) for wire in WIRES),
+        *((f"{HERE}:{name}", "default") for name in ("Bare", "BarePython")),
+    ],
+)
+def test_a_log_of_any_law_and_wire_is_computed_again_as_it_was(kind: str, wire: str, tmp_path: Path) -> None:
+    """What was computed is what telemetry said; every command replays byte for byte, also from the middle on."""
+    settings, log = load(overrides=["loop.lockstep=true", f"law.kind={kind}", *WIRES[wire]]), tmp_path / "a.mcap"
+    changes = AN_OPERATORS_WORDS if kind == "adaptive" else {250: AN_OPERATORS_WORDS[250]}
+    make_log(log, 500, settings=settings, changes=changes, lost={30, 31, 300})
+    assert replay([log]).controller == EndReplay(ticks=497, differ=0)
+    ticks = recompute(Recording([log]).session((VEHICLE, SESSION))).ticks
+    names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
+    at = {k: i for i, k in enumerate(ticks.k.tolist())}
+    published = 0
+    for found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
+        telemetry = Telemetry.model_validate_json(found.data)
+        i = at[telemetry.tick]
+        assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
+        assert bits(ticks.rate_error[i]) == bits(telemetry.rate_error)
+        assert bits(ticks.unquantized[i]) == bits(telemetry.voltages)
+        assert bits(ticks.state_next[i]) == bits([x for name in names for x in telemetry.state[name]])
+        published += 1
+    assert published > 40
+    make_log(log, 500, settings=settings, changes={}, begin=260)
+    both = replay([log])
+    if both.controller is not None:
+        assert both.controller.differ == 0
+
+
+def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A law that hung once hangs whenever it is run: a reader of its log needs the errors, and no voltages."""
+    lost = {50, 51, 52, 120}
+    settings = load(overrides=["loop.lockstep=true", f"law.kind={PYTHON}"])
+    make_log(tmp_path / "a.mcap", 200, settings=settings, lost=lost)
+    runs, step = list[object](), own_laws.Python.step
+
+    def counted(law: Any, now: Any) -> Any:
+        runs.append(now)
+        return step(law, now)
+
+    monkeypatch.setattr(own_laws.Python, "step", counted)
+    found = recompute(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION)))
+    assert len(runs) == 200 - len(lost)
+    assert set(found.missed.tolist()) == lost
+    its = found.ticks.where(np.isin(found.ticks.k, list(lost)))
+    assert np.isnan(its.unquantized).all()
+    assert len(its.k) == len(lost)
+    for column in (its.attitude, its.desired, its.rate, its.attitude_error, its.rate_error):
+        assert not np.isnan(column).any()
+
+
+def test_the_sign_of_q_goes_on_where_only_the_plant_has_a_tick(tmp_path: Path) -> None:
+    """A body that turns by a degree a tick, whose measurements have η ≥ 0: past half a turn q is the negative one."""
+    settings, messages, clocks = load(), Messages(), (Clock("plant"), Clock("controller"))
+    wire, end = settings.wire, ControllerEnd(settings, messages, clocks[1])
+    plant = TraceWriter("plant", wire, RUNS["plant"], 10**12)
+    plant.session = SESSION
+    for k in range(400):
+        for clock in clocks:
+            clock.now_ns = k * settings.loop.period_ns
+        half = np.radians(k) / 2
+        eps = 0.0, 0.0, np.sin(half) * np.sign(np.cos(half))
+        codes = [wire.attitude.quantizer().encode(x) for x in eps] + [wire.rate.quantizer().encode(0.0)] * 3
+        frame, at_ns = wire.measurement.pack(k % wire.measurement.counters, codes), clocks[1].monotonic_ns()
+        if not 250 <= k < 300:
+            command = end.controller.tick(frame, k)
+            end.record(PlantTick(k, frame, Received.FRAME, at_ns, at_ns), command, at_ns)
+        sent_ns, none = clocks[0].monotonic_ns(), bytes(wire.command.size)
+        plant.row(PlantRow(k, k, Sent.FRAME, Sent.NONE, Outcome.NONE, 0, -1, sent_ns, 0, frame, none, (0.0, 0.0)))
+        if k % 200 == 199:
+            messages.add("trace", plant.take(sent_ns, clocks[0].time_ns(), final=k == 399), clocks[0], "plant")
+    end.publish(final=True)
+    log = write(tmp_path / "a.mcap", settings, messages.all)
+    ticks = recompute(Recording([log]).session((VEHICLE, SESSION))).ticks
+    assert ticks.k.tolist() == list(range(400))
+    assert np.abs(np.diff(ticks.attitude, axis=0)).max() < 0.2  # of η where ε has its outermost level, 0.996
+    assert ticks.attitude[-1, 0] < -0.9
+
+
+def test_a_part_of_a_session_has_the_ticks_of_the_whole(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 1500, settings=load(), changes=AN_OPERATORS_WORDS, lost={700})
+    whole, part = (
+        recompute(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION), *times)).ticks
+        for times in ((), (1.0, 2.0))
+    )
+    assert part.k.tolist() == list(range(500, 1001))
+    for name in Ticks._fields:
+        if "delay" not in name:  # the clocks' offset is fitted by what is read
+            assert bits(getattr(part, name)) == bits(getattr(whole, name)[500:1001]), name
+    assert len(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION), 1.0, 2.0).controller) < 800
+
+
+def test_a_log_that_takes_more_memory_than_there_is_is_refused_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_log(tmp_path / "a.mcap", 600)
+    session = Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION))
+    monkeypatch.setattr(recording_module, "available_bytes", lambda: 300_000)
+    with pytest.raises(ReviewError, match=r"600 ticks take .* GiB of memory, .* choose a part with --from and --to"):
+        recompute(session)
+
+
+def test_ticks_and_z_track_are_found_by_the_specification_alone() -> None:
+    """A program of 40 lines, which imports mcap and numpy: tests/readers/read_trace.py."""
+    program = Path(__file__).parents[2] / "readers" / "read_trace.py"
+    lines = [line for line in program.read_text().splitlines() if line.startswith(("import", "from"))]
+    assert lines == ["import sys", "import numpy as np", "from mcap.reader import make_reader"]
+    log = GOLDEN / "can.mcap"
+    run = subprocess.run([sys.executable, program, log], capture_output=True, text=True, check=True)
+    controller, plant, z_track = run.stdout.split()
+    (extent,) = Recording([log]).extents.values()
+    assert {"controller": int(controller), "plant": int(plant)} == extent.rows
+    assert float(z_track) == pytest.approx(review(log).z_track, rel=1e-12)

@@ -1,0 +1,168 @@
+"""Lines of a report: every quantity of the controller at every tick, or an outline with every extreme in its place."""
+
+from __future__ import annotations
+
+from math import cos, nan, radians, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.wire.attitude import to_euler
+from aeroloop.service.config import load
+from aeroloop.service.logs.recording import ReviewError
+from aeroloop.service.logs.table import euler_deg
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.events import Truths
+from aeroloop.service.review.panels import outline, panels_of
+from aeroloop.service.review.report import Line
+from aeroloop.service.review.review import read
+from aeroloop.service.review.theorem import check_theorem
+from tests.service.review.conftest import TICKS
+from tests.support.decoded import product
+from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest, message_of, rewrite
+from tests.support.made_log import SESSION, START_NS
+
+NO_TRUTHS = Truths(np.empty(0, dtype=np.int64), np.empty((0, 4)), np.empty((0, 3)))
+
+Drawn = dict[tuple[str, str], Line]
+"""Lines by the label of their panel's axis, and their own."""
+
+
+def drawn(ticks: Ticks, truths: Truths = NO_TRUTHS) -> Drawn:
+    """What is drawn of ticks of the default configuration."""
+    _, panels, _ = panels_of(load(), ticks, check_theorem(load(), ticks, truths))
+    return {(panel.label, line.label): line for panel in panels for line in panel.lines}
+
+
+def test_a_short_session_is_drawn_exactly(whole: Path) -> None:
+    judged = read(whole)
+    made, ticks = judged.report(), judged.ticks
+    lines = {(panel.group, panel.label, line.label): line.values for panel in made.panels for line in panel.lines}
+    assert made.thinned == 1
+    assert made.time.tolist() == (ticks.k * 0.002).tolist()
+    assert lines["rate", "ω₃", "measured"].tolist() == ticks.rate[:, 2].tolist()
+    assert lines["rate", "ω₃", "desired"].tolist() == ticks.desired_rate[:, 2].tolist()
+    assert lines["attitude", "ε₂", "desired"].tolist() == ticks.desired[:, 2].tolist()
+    assert lines["attitude_error", "ε̃₁", "measured"].tolist() == ticks.attitude_error[:, 0].tolist()
+    assert lines["rate_error", "ω_e2", "measured"].tolist() == ticks.rate_error[:, 1].tolist()
+    assert lines["input", "u₂", "commanded"].tolist() == ticks.voltages[:, 0].tolist()
+    assert lines["latency", "latency", "latency"][:-1].tolist() == [LATENCY_NS / 1e3] * (TICKS - 1)
+    assert lines["period", "period", "period"][1:].tolist() == [PERIOD_NS / 1e3] * (TICKS - 1)
+    assert lines["damping_estimate", "θ̂₂", "estimated"].tolist() == ticks.state[:, 1].tolist()
+    assert ticks.state[0, 1] == pytest.approx(0.007, abs=1e-4)  # as Table C.1 has it, before it adapts
+    assert max(lines["error_angle", "angle", "measured"]) == pytest.approx(judged.figures.max_error_deg)
+    assert judged.figures.final_error_deg == pytest.approx(lines["error_angle", "angle", "measured"][-1])
+
+
+def test_panels_stand_in_the_order_of_the_papers_figures_and_are_named_after_them(whole: Path) -> None:
+    made = read(whole).report()
+    assert list(dict.fromkeys((panel.group, panel.title.partition(":")[0]) for panel in made.panels)) == [
+        ("angles", "Roll, pitch and yaw"),
+        ("attitude", "Figure C.7"),
+        ("rate", "Figure C.8"),
+        ("attitude_error", "Figure C.9"),
+        ("rate_error", "Figure C.10"),
+        ("input", "Figure C.11"),
+        ("error_angle", "Attitude error, as an angle"),
+        ("latency", "Loop latency"),
+        ("period", "Period between measurements"),
+        ("damping_estimate", "Damping estimate"),
+        ("z_norm", "Error of Theorem 1"),
+        ("lyapunov", "Lyapunov function"),
+    ]
+    assert [panel.label for panel in made.panels][:7] == ["roll", "pitch", "yaw", "η", "ε₁", "ε₂", "ε₃"]
+    assert all(line.values.shape == made.time.shape for panel in made.panels for line in panel.lines)
+
+
+def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() -> None:
+    other = np.array([[-0.6, 0.0, -0.8, 0.0], [0.6, 0.0, 0.8, 0.0]])
+    lines = drawn(at_rest(range(2), attitude=other, desired=np.abs(other)))
+    assert lines["η", "measured"].values.tolist() == lines["η", "desired"].values.tolist() == [0.6, 0.6]
+
+
+def test_roll_pitch_and_yaw_are_the_angles_of_each_quaternion() -> None:
+    q = np.random.default_rng(1).normal(size=(200, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    np.testing.assert_allclose(euler_deg(q), np.degrees([to_euler(tuple(one)) for one in q.tolist()]), atol=1e-9)
+
+
+def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_and_true_stays_beside_it() -> None:
+    """The reference turns about z at 10° a tick; the body lags by 4°, as measured, and by 5° truly."""
+
+    def yawed(lag: float) -> np.ndarray:
+        halves = np.radians(10.0 * np.arange(60) - lag) / 2
+        return np.column_stack([np.cos(halves), np.zeros((60, 2)), np.sin(halves)])
+
+    ticks = at_rest(range(60), attitude=yawed(4), desired=yawed(0))
+    lines = drawn(ticks, Truths(ticks.k, yawed(5), np.zeros((60, 3))))
+    for name, lag in (("desired", 0), ("measured", 4), ("true", 5)):
+        np.testing.assert_allclose(lines["yaw", name].values, 10.0 * np.arange(60) - lag, atol=1e-6)
+
+
+def test_a_part_is_all_that_is_read_and_the_findings_say_so(whole: Path) -> None:
+    judged, entire = read(whole, since_s=0.2, until_s=0.3), read(whole)
+    made, its = judged.report(), entire.ticks.where(slice(100, 151))
+    assert made.time.tolist() == pytest.approx([0.002 * k for k in range(100, 151)])
+    assert (made.thinned, made.part) == (1, (0.2, 0.3))
+    for name in ("attitude_error", "voltages", "state", "latency_ns"):
+        np.testing.assert_array_equal(getattr(judged.ticks, name), getattr(its, name))
+    found = judged.findings
+    assert (found.duration_s, found.timing["latency"].count, found.skipped_ticks) == (0.102, 51, 0)
+    assert found.reasons["duration_s"] == "of the session only what is from 0.2 s to 0.3 s was read"
+    assert found.z_track == pytest.approx(float((its.attitude_error**2).sum()) * 0.002)
+    assert {mark.time_s for mark in found.marks} == {None}  # the session's first gains and reference, before it
+    with pytest.raises(ReviewError, match="there is nothing from 2 s to 3 s: the session has 1 s"):
+        read(whole, since_s=2, until_s=3)
+
+
+def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_path: Path) -> None:
+    """The truth, sent at every tenth tick, is the desired attitude turned by 10°: the angle between them is that."""
+    turn = cos(radians(5)), 0.0, sin(radians(5)), 0.0
+    ticks = read(whole).ticks
+    more = [
+        message_of(
+            "truth",
+            Truth(tick=k, session=SESSION, session_tick=k, attitude=product(tuple(desired), turn), rate=(0, 0, 0),
+                  voltages=(0, 0)),
+            START_NS + k * PERIOD_NS + 1000,
+        )
+        for k, desired in list(zip(ticks.k.tolist(), ticks.desired.tolist(), strict=True))[::10]
+    ]  # fmt: skip
+    made = read(rewrite(whole, tmp_path / "a.mcap", more=more)).report()
+    (panel,) = (panel for panel in made.panels if panel.group == "error_angle")
+    assert [line.label for line in panel.lines] == ["measured", "true"]
+    assert panel.lines[1].values[1:-10] == pytest.approx(10.0, abs=0.05)  # interpolated while q_d turns
+
+
+def test_the_true_error_is_that_of_the_law_however_far_the_body_is_turned() -> None:
+    desired = 0.5, -0.5, 0.5, 0.5
+    ticks = at_rest(range(3), desired=np.tile(desired, (3, 1)))
+    turned = np.tile(product(desired, (cos(radians(15)), sin(radians(15)), 0.0, 0.0)), (3, 1))
+    lines = drawn(ticks, Truths(ticks.k, turned, np.zeros((3, 3))))
+    assert lines["angle", "true"].values == pytest.approx([30.0] * 3)
+
+
+@pytest.mark.parametrize("rows", [65, 127, 1000, 5003])
+def test_an_outline_keeps_every_extreme_in_its_bucket_and_goes_the_way_of_its_line(rows: int) -> None:
+    rng = np.random.default_rng(rows)
+    values, starts = rng.normal(size=rows), np.linspace(0, rows, 32, endpoint=False).astype(np.int64)
+    values[rng.random(rows) < 0.3] = nan
+    drawn = outline(values, starts)
+    assert drawn.shape == (64,)
+    for bucket, points in zip(np.split(values, starts[1:]), drawn.reshape(-1, 2), strict=True):
+        if not np.isnan(bucket).all():
+            assert sorted(points) == [np.nanmin(bucket), np.nanmax(bucket)]
+    k = np.arange(rows, dtype=float)
+    assert (np.diff(outline(k, starts)) >= 0).all()
+    assert (np.diff(outline(-k, starts)) <= 0).all()
+
+
+def test_a_long_session_has_so_many_points_at_times_that_rise_through_all_of_it() -> None:
+    ticks = at_rest(range(20_001))
+    time, panels, thinned = panels_of(load(), ticks, check_theorem(load(), ticks, NO_TRUTHS), 4096)
+    assert (len(time), thinned) == (4096, 10)
+    assert (np.diff(time) > 0).all()
+    assert (time[0] < 10 * 0.002, time[-1] > 19_990 * 0.002) == (True, True)
+    assert all(len(line.values) == 4096 for panel in panels for line in panel.lines)
