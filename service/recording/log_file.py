@@ -18,16 +18,16 @@ from mcap.writer import Writer
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, with_checksum
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
 TRACE_ENCODING: Final = "x-aeroloop-trace"
 
-NO_LIMIT: Final = 1 << 60
+_NO_LIMIT: Final = 1 << 60
 """A chunk size [bytes] that none reaches: `LogFile.commit` alone closes chunks."""
-
-MESSAGE_HEAD: Final = 31
+_MESSAGE_HEAD: Final = 31
 """Bytes of a message record in front of its data."""
+_32_BITS: Final = 0xFFFF_FFFF
 
 
 class _WholeChunks:
@@ -71,9 +71,6 @@ class _WholeChunks:
         self._file.close()
 
 
-_32_BITS: Final = 0xFFFF_FFFF
-
-
 class LogFile:
     """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created."""
 
@@ -83,7 +80,7 @@ class LogFile:
         self._channels: dict[str, int] = {}
         self._shapes: dict[Shape, int] = {}
         self._gathered = 0  # bytes of messages in the open chunk
-        self._writer = Writer(self._out, chunk_size=NO_LIMIT, enable_data_crcs=True)  # type: ignore[arg-type]  # it calls write, tell and flush
+        self._writer = Writer(self._out, chunk_size=_NO_LIMIT, enable_data_crcs=True)  # type: ignore[arg-type]  # it calls write, tell and flush
         self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
 
     @property
@@ -116,6 +113,10 @@ class LogFile:
         """Add a metadata record, under a checksum."""
         self._writer.add_metadata(name, with_checksum(name, entries))
 
+    def add_description(self, key: str, payload: bytes) -> None:
+        """Add a role's last description as metadata."""
+        self.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": payload.decode()})
+
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, which a reader of frames needs."""
         text = files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
@@ -144,7 +145,7 @@ class LogFile:
 
     def _add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int) -> None:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
-        self._gathered += MESSAGE_HEAD + len(data)
+        self._gathered += _MESSAGE_HEAD + len(data)
 
     def _channel(self, topic: str, shape: Shape | None) -> int:
         """Id of a topic's channel; a key has the shape of its raw messages."""
