@@ -37,7 +37,7 @@ AT_ONCE: Final = 2000
 """Messages written before anything else is done: the service manager expects a status."""
 
 WAITING_BYTES: Final = 200_000_000
-"""Of messages that wait for the disk, with `OVERHEAD` for each."""
+"""Of messages that wait while the disk refuses, with `OVERHEAD` for each; the newest that find no room are lost."""
 OVERHEAD: Final = 600
 
 END_S: Final = 8.0
@@ -151,11 +151,11 @@ class Recorder:
         if address is not None and address.topic.name == "description":
             self._configure(received, at_ns)  # at once: other messages are decoded by it
         size = len(received.payload) + OVERHEAD
-        if self._waiting_bytes + size > WAITING_BYTES:
-            self._refused[received.key] += 1
-        else:
+        if self.log.writable or self._waiting_bytes + size <= WAITING_BYTES:
             self.waiting.append((received, at_ns))
             self._waiting_bytes += size
+        else:
+            self._refused[received.key] += 1
 
     def _configure(self, received: Delivery, at_ns: int) -> None:
         published_ns = received.published_ns or at_ns

@@ -21,15 +21,14 @@ from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport import history
-from aeroloop.protocol.transport.history import SOON_S, CachedPublisher, attachment
+from aeroloop.protocol.transport.history import CachedPublisher, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
-from aeroloop.service.recording import backlog, rolling
+from aeroloop.service.recording import recorder, rolling
 from aeroloop.service.recording.log_file import TRACE_ENCODING
-from aeroloop.service.recording.recorder import MANY, WORK_EVERY_S, Recorder
+from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
-from aeroloop.service.recording.subscriptions import Subscriptions
 from aeroloop.service.settings import RecorderSettings
 from tests.service.recording.conftest import CHANGES
 from tests.support.cable import Cable
@@ -114,7 +113,7 @@ Record = Callable[..., Running]
 @pytest.fixture
 def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
     """Starts recorders: in memory there is room for fifty messages, and the disk is tried ten times a second."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", ROOM)
+    monkeypatch.setattr(recorder, "WAITING_BYTES", ROOM * (recorder.OVERHEAD + 4))
     monkeypatch.setattr(rolling, "RETRY_S", 0.1)
     running: list[Running] = []
 
@@ -171,9 +170,8 @@ def statuses(gathering: Gathering) -> list[Status]:
 
 
 def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and_every_file_can_be_read_alone(
-    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+    gathering: Gathering, record: Record
 ) -> None:
-    monkeypatch.setattr(rolling, "LOOK_S", 0.0)
     session, settings = gathering.join(), load()
     publishers: dict[str, CachedPublisher] = {}
     published: dict[str, list[bytes]] = {}
@@ -251,44 +249,11 @@ def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_mes
     assert running.losses() == []
 
 
-class Waits(threading.Event):
-    """An event that keeps how long it was waited for [s]."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.asked: list[float | None] = []
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.asked.append(timeout)
-        return super().wait(timeout)
-
-
-@pytest.mark.parametrize("recovering", [False, True])
-def test_the_next_messages_are_taken_soon_while_many_come_or_caches_are_queried_and_else_seldom(
-    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch, recovering: bool
-) -> None:
-    """What waits in a ring may hold far more memory than its own size; of a cache a page is taken at a time."""
-    monkeypatch.setattr(Subscriptions, "recovering", recovering)
-    running, waits = record(), Waits()
-    running.role.stop = waits
-    publisher.send(1)
-    eventually("the first", lambda: running.recorder.log.written > 2)
-    if recovering:
-        eventually("soon", lambda: waits.asked[-1] == SOON_S)
-        monkeypatch.setattr(Subscriptions, "recovering", False)
-        eventually("as seldom as before", lambda: waits.asked[-1] == WORK_EVERY_S)
-        waits.asked.clear()
-    assert set(waits.asked) <= {WORK_EVERY_S}
-    publisher.send(2 * MANY)
-    eventually("soon", lambda: SOON_S in waits.asked)
-    eventually("quiet", lambda: waits.asked[-1] == WORK_EVERY_S)
-
-
 def test_a_recorder_that_ends_takes_what_caches_still_hold(
     gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends as soon as its cable is back and a new message has come: 2.5 MB were published meanwhile."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
+    monkeypatch.setattr(recorder, "WAITING_BYTES", 200_000_000)
     port, count = free_port(), 1700
     far = gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1))
     published = CachedPublisher(far, KEY, per_s=1000)
@@ -319,7 +284,7 @@ def test_a_recorder_that_comes_again_begins_with_what_its_older_file_lacks(
     gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The publisher ends soon after: what it published last is there."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
+    monkeypatch.setattr(recorder, "WAITING_BYTES", 200_000_000)
     session = gathering.join()
     published = CachedPublisher(session, KEY, per_s=1000)
     for _ in range(2000):
@@ -395,7 +360,7 @@ def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(502)
     eventually("its word", lambda: any(status.state == "not recording" and status.cause for status in reported))
-    eventually("a full backlog", lambda: len(running.recorder._backlog) == ROOM)
+    eventually("a full backlog", lambda: len(running.recorder.waiting) == ROOM)
     running.full = False
     eventually(
         "its word",
@@ -445,7 +410,7 @@ def test_a_recorder_that_is_stopped_when_the_disk_has_room_again_writes_what_wai
     publisher.send(1)
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(30)
-    eventually("all", lambda: len(running.recorder._backlog) >= 29)
+    eventually("all", lambda: len(running.recorder.waiting) >= 29)
     running.full = False
     running.end()
     assert running.error is None
@@ -465,4 +430,3 @@ def test_a_recorder_that_is_stopped_while_the_disk_is_full_reports_how_much_is_l
     count, _, rest = str(running.error).partition(" ")
     assert int(count) >= 29
     assert rest.startswith(f"messages and the index of {running.path} could not be written")
-    running.recorder.log._file.abandon()
