@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -359,6 +360,31 @@ def test_a_subscriber_that_comes_late_or_again_gets_everything_that_is_kept_once
         assert before_ns <= stamps[0]
         assert stamps == sorted(stamps)
         session.close()
+
+
+def test_messages_published_while_a_link_is_set_up_do_not_hide_what_was_published_before(network: Gathering) -> None:
+    """The publisher is met by gossip, in the midst of a thousand messages a second."""
+    network.join()  # holds the rendezvous
+    publisher, over = CachedPublisher(network.join(), KEY, per_s=1000), threading.Event()
+
+    def publish() -> None:
+        while not over.wait(0.001):
+            publisher.put(b"")
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        time.sleep(0.5)
+        subscriber = RecoveringSubscriber(network.join(), ANY)
+        received = collect(subscriber, 500)
+    finally:
+        over.set()
+        thread.join()
+    publisher.put(b"last")
+    while received[-1].payload != b"last" or len(received) <= received[-1].number:
+        received = collect(subscriber, len(received) + 1, received)
+    assert [each.number for each in received] == list(range(len(received)))
+    assert subscriber.losses() == []
 
 
 def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
