@@ -186,7 +186,7 @@ def test_the_rows_of_each_end_give_what_it_sent_as_frames_do_at_the_times_of_sen
 def test_frames_give_nothing_before_a_description_and_are_read_by_the_plants() -> None:
     decoder, payload = Decoder(None), measurement(*sent_vector(ATTITUDE), 0, 0, 0)
     malformed, shown = [], []
-    steps = (
+    steps: tuple[list[Description], ...] = (
         [],
         [description("recorder")],
         [description("controller", "wire.attitude.bits=12")],
