@@ -62,12 +62,8 @@ SHAPES: Final = {
 }
 """Topics below `/<vehicle>/`."""
 
-_LEVELS: Final = {
-    "tripped": LogLevel.Error,
-    "fault": LogLevel.Error,
-    "lost": LogLevel.Warning,
-    "refused": LogLevel.Warning,
-}
+_ERROR, _WARNING = LogLevel.Error, LogLevel.Warning
+_LEVELS: Final = {"tripped": _ERROR, "fault": _ERROR, "lost": _WARNING, "refused": _WARNING}
 """Log level by kind of event; Info for all others."""
 
 _Values = tuple[str | float | None, ...]
@@ -178,8 +174,8 @@ class Decoder:
         if name == "command":
             return _encoded(vehicle, [(name, _voltages(wire, codes))], at_ns)
         x, y, z = map(wire.attitude.level, codes[:3])
-        valid = x + y + z == x + y + z  # not NaN
-        measured = attitude.received_quaternion(x, y, z, attitude.IDENTITY) if valid else None
+        known = x + y + z == x + y + z  # not NaN: a valid value
+        measured = attitude.received_quaternion(x, y, z, attitude.IDENTITY) if known else None
         rate: attitude.Vector = tuple(map(wire.rate.level, codes[3:]))  # type: ignore[assignment]  # three of them
         shown: list[_Shown] = [(name, _attitude(measured, rate))]
         if measured:
@@ -249,7 +245,7 @@ def _event(message: Event, address: topics.Address, _: object, at_ns: int) -> li
 
 def _loss(message: Loss, _: object, __: object, at_ns: int) -> list[_Shown]:
     text = f"{message.count} messages of {message.key} are not in the log: {LOSS_REASONS[message.reason]}"
-    return _logged(LogLevel.Warning, "recorder", text, at_ns)
+    return _logged(_WARNING, "recorder", text, at_ns)
 
 
 _CONVERTERS: Final[dict[str, Callable[[Any, topics.Address, _Wire | None, int], list[_Shown]]]] = {
@@ -321,6 +317,7 @@ def _posed(prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> list[
 _BEAM, _NOSE, _TAIL = (0.35, 0.38, 0.42), (0.85, 0.2, 0.15), (0.15, 0.4, 0.75)
 """Red, green and blue, 0…1; red points forward."""
 _UPRIGHT, _SIDEWAYS = Quaternion(w=1.0), Quaternion(x=sqrt(0.5), w=sqrt(0.5))
+_Triple = tuple[float, float, float]
 
 
 def _scene(vehicle: str, kind: str, at_ns: int) -> SceneUpdate:
@@ -328,13 +325,10 @@ def _scene(vehicle: str, kind: str, at_ns: int) -> SceneUpdate:
 
     `kind` is `plant.kind`. Lengths are in metres, about those of the bench.
     """
-    parts = [
-        (vehicle, f"{vehicle} body", *_body(kind, 1.0)),
-        (f"{vehicle}_desired", f"{vehicle}_desired desired", *_body(kind, 0.25)),
-    ]
+    desired = f"{vehicle}_desired"
+    parts = [(vehicle, f"{vehicle} body", *_body(kind, 1.0)), (desired, f"{desired} desired", *_body(kind, 0.25))]
     if kind == "aero":
-        column = _cylinder(0.0, -0.17, (0.04, 0.04, 0.3), _UPRIGHT, _BEAM, 1.0)
-        foot = _cylinder(0.0, -0.33, (0.3, 0.3, 0.02), _UPRIGHT, _BEAM, 1.0)
+        column, foot = _cylinder(0.0, -0.17, (0.04, 0.04, 0.3)), _cylinder(0.0, -0.33, (0.3, 0.3, 0.02))
         parts.append((WORLD, f"{vehicle} stand", [], [column, foot]))
     at = _timestamp(at_ns)
     return SceneUpdate(
@@ -349,26 +343,27 @@ def _body(kind: str, alpha: float) -> tuple[list[CubePrimitive], list[CylinderPr
     if kind != "aero":
         return [_box(0.0, (0.3, 0.2, 0.1), _BEAM, alpha), _box(0.17, (0.04, 0.1, 0.05), _NOSE, alpha)], []
     return [_box(0.0, (0.36, 0.03, 0.03), _BEAM, alpha)], [
-        _cylinder(0.18, 0.0, (0.14, 0.14, 0.02), _UPRIGHT, _NOSE, alpha),
-        _cylinder(-0.18, 0.0, (0.14, 0.14, 0.02), _SIDEWAYS, _TAIL, alpha),
+        _cylinder(0.18, 0.0, (0.14, 0.14, 0.02), _NOSE, alpha),
+        _cylinder(-0.18, 0.0, (0.14, 0.14, 0.02), _TAIL, alpha, _SIDEWAYS),
     ]
 
 
-def _box(x: float, size: attitude.Vector, rgb: attitude.Vector, alpha: float) -> CubePrimitive:
-    pose = Pose(position=Vector3(x=x), orientation=_UPRIGHT)
-    return CubePrimitive(pose=pose, size=_vector(size), color=_color(rgb, alpha))
+def _box(x: float, size: _Triple, rgb: _Triple, alpha: float) -> CubePrimitive:
+    return CubePrimitive(**_placed(x, 0.0, size, rgb, alpha))
 
 
 def _cylinder(
-    x: float, z: float, size: attitude.Vector, turned: Quaternion, rgb: attitude.Vector, alpha: float
+    x: float, z: float, size: _Triple, rgb: _Triple = _BEAM, alpha: float = 1.0, turned: Quaternion = _UPRIGHT
 ) -> CylinderPrimitive:
-    pose = Pose(position=Vector3(x=x, z=z), orientation=turned)
-    return CylinderPrimitive(pose=pose, size=_vector(size), bottom_scale=1.0, top_scale=1.0, color=_color(rgb, alpha))
+    return CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **_placed(x, z, size, rgb, alpha, turned))
 
 
-def _vector(v: attitude.Vector) -> Vector3:
-    return Vector3(x=v[0], y=v[1], z=v[2])
-
-
-def _color(rgb: attitude.Vector, alpha: float) -> Color:
-    return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+def _placed(
+    x: float, z: float, size: _Triple, rgb: _Triple, alpha: float, turned: Quaternion = _UPRIGHT
+) -> dict[str, Any]:
+    """What boxes and cylinders have: a place (x, 0, z), a size and a color."""
+    return {
+        "pose": Pose(position=Vector3(x=x, z=z), orientation=turned),
+        "size": Vector3(x=size[0], y=size[1], z=size[2]),
+        "color": Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha),
+    }

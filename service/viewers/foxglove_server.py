@@ -30,8 +30,8 @@ from aeroloop.service.viewers.schemas import Decoded, Shape
 
 log: Final = logging.getLogger("aeroloop")
 
-ROOM: Final = {"always": 1024, "limited": 1}
-"""Messages of a topic that may wait to be taken; of frames one, too."""
+ROOM: Final = 1024
+"""Events, losses or statuses that may wait to be taken; of streaming topics, one message."""
 BACKLOG: Final = 256
 """Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
 
@@ -47,12 +47,9 @@ class LiveDecoder:
         self._decoder = Decoder(None)  # the rate of `take` bounds it
         self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
         self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
-        self._rings = []
-        for topic in topics.TOPICS.values():
-            if topic.decoded or topic.kind == "frame":
-                room = ROOM[topic.decoded or "limited"]
-                ring = session.declare_subscriber(topics.key(topic.name, vehicle), RingChannel(room))
-                self._rings.append((ring, room))
+        shown = [topic for topic in topics.TOPICS.values() if topic.decoded or topic.kind == "frame"]
+        rooms = {topics.key(topic.name, vehicle): ROOM if topic.decoded == "always" else 1 for topic in shown}
+        self._rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
 
     def take(self) -> Iterator[Decoded]:
         """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
