@@ -12,21 +12,7 @@ from collections.abc import Callable, Sequence
 from math import degrees, sqrt
 from typing import Any, Final
 
-from foxglove.messages import (
-    Color,
-    CubePrimitive,
-    CylinderPrimitive,
-    FrameTransform,
-    Log,
-    LogLevel,
-    Pose,
-    PoseInFrame,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    Timestamp,
-    Vector3,
-)
+from foxglove import messages as foxglove
 from pydantic import ValidationError
 from pydantic_core import to_json
 
@@ -44,8 +30,8 @@ WORLD: Final = "world"
 ROLES: Final = ("plant", "controller", "recorder")
 """Roles with a status topic from the start; statuses of other roles are decoded, too."""
 
-_POSE: Final = protobuf_shape(PoseInFrame.get_schema())
-_TRANSFORM: Final = protobuf_shape(FrameTransform.get_schema())
+_POSE: Final = protobuf_shape(foxglove.PoseInFrame.get_schema())
+_TRANSFORM: Final = protobuf_shape(foxglove.FrameTransform.get_schema())
 SHAPES: Final = {
     "pose": _POSE,
     "tf": _TRANSFORM,
@@ -56,18 +42,18 @@ SHAPES: Final = {
     "desired_tf": _TRANSFORM,
     "truth": schemas.ATTITUDE,
     "setpoint": schemas.SETPOINT,
-    "scene": protobuf_shape(SceneUpdate.get_schema()),
-    "log": protobuf_shape(Log.get_schema()),
+    "scene": protobuf_shape(foxglove.SceneUpdate.get_schema()),
+    "log": protobuf_shape(foxglove.Log.get_schema()),
     **{f"status/{role}": schemas.STATUS for role in ROLES},
 }
 """Topics below `/<vehicle>/`."""
 
-_ERROR, _WARNING = LogLevel.Error, LogLevel.Warning
+_ERROR, _WARNING = foxglove.LogLevel.Error, foxglove.LogLevel.Warning
 _LEVELS: Final = {"tripped": _ERROR, "fault": _ERROR, "lost": _WARNING, "refused": _WARNING}
 """Log level by kind of event; Info for all others."""
 
 _Values = tuple[str | float | None, ...]
-_Shown = tuple[str, _Values | PoseInFrame | FrameTransform | SceneUpdate | Log]
+_Shown = tuple[str, _Values | foxglove.PoseInFrame | foxglove.FrameTransform | foxglove.SceneUpdate | foxglove.Log]
 """A topic's name, and the values of its view or a message of Foxglove's."""
 
 
@@ -128,10 +114,9 @@ class Decoder:
             if topic.kind == "trace":
                 return self._rows(vehicle, wire, payload)
             if topic.kind == "frame":
-                unchanged = wire is not None and payload == UNCHANGED and topic.name in wire.on_change
-                return (
-                    [] if wire is None or unchanged else self._frame(vehicle, wire, topic.name, payload, published_ns)
-                )
+                if wire is None or (payload == UNCHANGED and topic.name in wire.on_change):
+                    return []
+                return self._frame(vehicle, wire, topic.name, payload, published_ns)
             if topic.model is None or topic.name not in _CONVERTERS:
                 return []
             if topic.decoded == "limited" and not self._due(topic.name, vehicle, published_ns):
@@ -239,7 +224,7 @@ def _status(message: Status, address: topics.Address, wire: _Wire | None, at_ns:
 
 
 def _event(message: Event, address: topics.Address, _: object, at_ns: int) -> list[_Shown]:
-    level = _LEVELS.get(message.kind, LogLevel.Info)
+    level = _LEVELS.get(message.kind, foxglove.LogLevel.Info)
     return _logged(level, str(address.role), f"{message.kind}: {message.text}", at_ns)
 
 
@@ -292,21 +277,21 @@ def _product(p: attitude.Quaternion, q: attitude.Quaternion) -> attitude.Quatern
     )
 
 
-def _timestamp(at_ns: int) -> Timestamp:
+def _timestamp(at_ns: int) -> foxglove.Timestamp:
     """A time since 1970 [ns] in Foxglove's type, which has 32 bits of seconds."""
     seconds, rest = divmod(at_ns, 1_000_000_000)
-    return Timestamp(min(max(seconds, 0), 0xFFFFFFFF), rest)
+    return foxglove.Timestamp(min(max(seconds, 0), 0xFFFFFFFF), rest)
 
 
-def _logged(level: LogLevel, name: str, text: str, at_ns: int) -> list[_Shown]:
-    return [("log", Log(timestamp=_timestamp(at_ns), level=level, message=text, name=name))]
+def _logged(level: foxglove.LogLevel, name: str, text: str, at_ns: int) -> list[_Shown]:
+    return [("log", foxglove.Log(timestamp=_timestamp(at_ns), level=level, message=text, name=name))]
 
 
 def _posed(prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> list[_Shown]:
     """An attitude as a pose in the world, and as the transform from the world to a frame."""
-    at, turned, here = _timestamp(at_ns), Quaternion(w=q[0], x=q[1], y=q[2], z=q[3]), Vector3()
-    pose = PoseInFrame(timestamp=at, frame_id=WORLD, pose=Pose(position=here, orientation=turned))
-    transform = FrameTransform(
+    at, turned, here = _timestamp(at_ns), foxglove.Quaternion(w=q[0], x=q[1], y=q[2], z=q[3]), foxglove.Vector3()
+    pose = foxglove.PoseInFrame(timestamp=at, frame_id=WORLD, pose=foxglove.Pose(position=here, orientation=turned))
+    transform = foxglove.FrameTransform(
         timestamp=at, parent_frame_id=WORLD, child_frame_id=frame, translation=here, rotation=turned
     )
     return [(f"{prefix}pose", pose), (f"{prefix}tf", transform)]
@@ -316,11 +301,11 @@ def _posed(prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> list[
 
 _BEAM, _NOSE, _TAIL = (0.35, 0.38, 0.42), (0.85, 0.2, 0.15), (0.15, 0.4, 0.75)
 """Red, green and blue, 0…1; red points forward."""
-_UPRIGHT, _SIDEWAYS = Quaternion(w=1.0), Quaternion(x=sqrt(0.5), w=sqrt(0.5))
+_UPRIGHT, _SIDEWAYS = foxglove.Quaternion(w=1.0), foxglove.Quaternion(x=sqrt(0.5), w=sqrt(0.5))
 _Triple = tuple[float, float, float]
 
 
-def _scene(vehicle: str, kind: str, at_ns: int) -> SceneUpdate:
+def _scene(vehicle: str, kind: str, at_ns: int) -> foxglove.SceneUpdate:
     """The body, a transparent copy at the desired attitude, and the stand, each fixed to its frame.
 
     `kind` is `plant.kind`. Lengths are in metres, about those of the bench.
@@ -331,15 +316,17 @@ def _scene(vehicle: str, kind: str, at_ns: int) -> SceneUpdate:
         column, foot = _cylinder(0.0, -0.17, (0.04, 0.04, 0.3)), _cylinder(0.0, -0.33, (0.3, 0.3, 0.02))
         parts.append((WORLD, f"{vehicle} stand", [], [column, foot]))
     at = _timestamp(at_ns)
-    return SceneUpdate(
+    return foxglove.SceneUpdate(
         entities=[
-            SceneEntity(timestamp=at, frame_id=frame, id=name, frame_locked=True, cubes=cubes, cylinders=cylinders)
+            foxglove.SceneEntity(
+                timestamp=at, frame_id=frame, id=name, frame_locked=True, cubes=cubes, cylinders=cylinders
+            )
             for frame, name, cubes, cylinders in parts
         ]
     )
 
 
-def _body(kind: str, alpha: float) -> tuple[list[CubePrimitive], list[CylinderPrimitive]]:
+def _body(kind: str, alpha: float) -> tuple[list[foxglove.CubePrimitive], list[foxglove.CylinderPrimitive]]:
     if kind != "aero":
         return [_box(0.0, (0.3, 0.2, 0.1), _BEAM, alpha), _box(0.17, (0.04, 0.1, 0.05), _NOSE, alpha)], []
     return [_box(0.0, (0.36, 0.03, 0.03), _BEAM, alpha)], [
@@ -348,22 +335,22 @@ def _body(kind: str, alpha: float) -> tuple[list[CubePrimitive], list[CylinderPr
     ]
 
 
-def _box(x: float, size: _Triple, rgb: _Triple, alpha: float) -> CubePrimitive:
-    return CubePrimitive(**_placed(x, 0.0, size, rgb, alpha))
+def _box(x: float, size: _Triple, rgb: _Triple, alpha: float) -> foxglove.CubePrimitive:
+    return foxglove.CubePrimitive(**_placed(x, 0.0, size, rgb, alpha))
 
 
 def _cylinder(
-    x: float, z: float, size: _Triple, rgb: _Triple = _BEAM, alpha: float = 1.0, turned: Quaternion = _UPRIGHT
-) -> CylinderPrimitive:
-    return CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **_placed(x, z, size, rgb, alpha, turned))
+    x: float, z: float, size: _Triple, rgb: _Triple = _BEAM, alpha: float = 1.0, turned: foxglove.Quaternion = _UPRIGHT
+) -> foxglove.CylinderPrimitive:
+    return foxglove.CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **_placed(x, z, size, rgb, alpha, turned))
 
 
 def _placed(
-    x: float, z: float, size: _Triple, rgb: _Triple, alpha: float, turned: Quaternion = _UPRIGHT
+    x: float, z: float, size: _Triple, rgb: _Triple, alpha: float, turned: foxglove.Quaternion = _UPRIGHT
 ) -> dict[str, Any]:
     """What boxes and cylinders have: a place (x, 0, z), a size and a color."""
     return {
-        "pose": Pose(position=Vector3(x=x, z=z), orientation=turned),
-        "size": Vector3(x=size[0], y=size[1], z=size[2]),
-        "color": Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha),
+        "pose": foxglove.Pose(position=foxglove.Vector3(x=x, z=z), orientation=turned),
+        "size": foxglove.Vector3(x=size[0], y=size[1], z=size[2]),
+        "color": foxglove.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha),
     }
