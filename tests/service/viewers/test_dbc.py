@@ -196,7 +196,7 @@ def test_messages_and_signals_are_described_and_bounded(spec: WireSpec) -> None:
             assert (signal.is_signed, signal.offset) == (True, 0)
             assert signal.unit == (None if bare(one) else UNITS[signal.name.rstrip("123")])
             top = 2 ** ((one.bits or 1) - 1) - 1 if bare(one) else quantizer_of(one).outermost
-            assert (-(signal.minimum or 0), signal.maximum) == (pytest.approx(top, rel=ROUNDING),) * 2
+            assert [-(signal.minimum or 0), signal.maximum] == pytest.approx([top, top], rel=ROUNDING)
 
 
 @pytest.mark.parametrize("off", [1.0, 1 + 2.0**-50, 1 + 1e-9])
