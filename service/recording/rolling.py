@@ -175,7 +175,6 @@ class RollingLog:
                 self._refused(error)
             elif now >= self._remind_due:  # a file that is too large is better than none
                 self._remind(f"no new file can be begun ({error.strerror}), so {self.path} goes on")
-            self._begun = now
             return
         if replaced:
             self._report(f"{last.path} was moved or removed while it was written", True)

@@ -106,29 +106,34 @@ def test_while_a_disk_is_full_it_is_tried_once_a_second_reported_once_and_what_i
     assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:400])
 
 
-@pytest.mark.parametrize("full", [False, True])
-def test_a_broken_disk_is_left_for_a_new_file_and_nothing_is_lost_or_doubled(
-    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk, full: bool
+@pytest.mark.parametrize("errors", [(errno.EIO,), (errno.EIO, errno.ENOSPC), (errno.ENOSPC, None)])
+def test_a_file_that_cannot_be_used_is_left_for_a_new_one_and_nothing_is_lost_or_doubled(
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk, errors: tuple[int | None, ...]
 ) -> None:
-    """Even if at first there is no room for the new file: what came to nothing is removed."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
+    """On a broken disk; also if at first there is no room for the new file: what came to nothing is removed.
+
+    And where the file was removed (None) while the disk was full: what is not written yet goes into a new one.
+    """
+    old, recovered = tmp_path / "a.mcap", tmp_path / "recovered"
+    recording = Recording(clock, story, path=old, chunk_s=0.05)
     recording.take(story.messages[:330])
-    disk.broken = errno.EIO
-    recording.take(story.messages[330:500])
-    recording.wait(2.0)
-    assert not recording.log.writable
-    if full:
-        disk.broken = errno.ENOSPC
-        recording.wait(1.0)
+    for error in errors:
+        if error is None:
+            recover(old, recovered)
+            old.unlink()
+        else:
+            disk.broken = error
+        recording.take(story.messages[330:500] if error == errors[0] else [])
+        recording.wait(2.0)
         assert not recording.log.writable
-        assert [path.name for path in in_order(tmp_path)] == ["a.mcap"]
+        assert in_order(tmp_path) == [old][: error is not None]
     disk.broken = 0
     recording.wait(1.0)
     recording.take(story.messages[500:])
     recording.log.close()
-    old, new = in_order(tmp_path)
-    recover(old, tmp_path / "recovered")
-    assert every_message([tmp_path / "recovered", new]) == numbered(story.messages)
+    if old.exists():
+        recover(old, recovered)
+    assert every_message([recovered, tmp_path / "a-0001.mcap"]) == numbered(story.messages)
 
 
 def test_a_file_that_is_moved_or_removed_is_reported_and_another_begun(
