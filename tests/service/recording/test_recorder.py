@@ -92,8 +92,8 @@ class Running:
         return [data for _, data in sorted((number, data) for topic, number, data in self.messages() if topic == key)]
 
     def numbers(self) -> list[int]:
-        """Numbers of the recorded messages of `KEY`, in the order of arrival."""
-        return [number for topic, number, _ in self.messages() if topic == KEY]
+        """Numbers of the recorded messages of `KEY`, ascending."""
+        return sorted(number for topic, number, _ in self.messages() if topic == KEY)
 
     def losses(self) -> list[tuple[str, int, str]]:
         """Key, how many and why, in the log."""
@@ -182,12 +182,28 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         running.end()
         assert {key: running.of(key) for key in published} == published
         assert running.losses() == []
-        with parts(running.path)[-1].open("rb") as file:
-            metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-        descriptions = {
-            entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA
-        }
-        assert descriptions[description] == published[description][0]
+        assert descriptions(parts(running.path)[-1])[description] == published[description][0]
+
+
+def descriptions(path: Path) -> dict[str, bytes]:
+    """The last description of each key that a file has as metadata."""
+    with path.open("rb") as file:
+        metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
+    return {entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA}
+
+
+def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
+    gathering: Gathering, record: Record
+) -> None:
+    running, key = record(), topics.key("description", "aero", role="plant")
+    declared = gathering.join().declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
+    for number, rate_hz in ((1, 200), (0, 100)):
+        payload = description_of(load(None, [f"loop.rate_hz={rate_hz}"]), "plant").encode()
+        declared.put(payload, attachment=attachment(START_NS + number, 4711, number))
+    running.await_written(4)
+    running.end()
+    assert b'"rate_hz":200.0' in descriptions(running.path)[key]
 
 
 def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishers_numbers(
@@ -259,7 +275,7 @@ def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering,
         running.end()
     found = running.numbers()
     assert len(found) > count
-    assert sorted(found) == list(range(len(found)))
+    assert found == list(range(len(found)))
     assert running.losses() == []
 
 
@@ -320,7 +336,7 @@ def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothi
     publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
-    eventually("all", lambda: running.recorder.log.written >= len(names) + 2)
+    running.await_written(len(names) + 2)
     running.end()
     assert running.error is None
     recorded = {key for key, _, data in running.messages() if data == b"\xff\x00"}
