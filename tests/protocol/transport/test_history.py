@@ -219,14 +219,20 @@ def test_a_loss_says_what_is_known() -> None:
     assert made.subscriber.losses() == [Loss(key=KEY, count=10, reason="gone")]
 
 
-def test_what_cannot_be_reached_but_may_have_more_is_named() -> None:
+def test_what_cannot_be_reached_but_may_have_more_is_named_and_not_waited_for() -> None:
     made = Made(10)
-    made.receive(made.publish())
-    found = []
+    for number in (0, 2):
+        made.receive(number)
+    found, complete = [], []
     for pause_s in (ANSWER_S - 0.1, 1.0, KEPT_S):
+        made.take()
+        made.queries.pop()[1].drop()  # answered by none
+        complete.append(made.subscriber.complete())
         made.now += pause_s
+        complete.append(made.subscriber.complete())
         found.append(made.subscriber.silent())
     assert found == [{}, {KEY: pytest.approx(ANSWER_S + 0.9)}, {}]
+    assert complete == [False, False, False, True, True, True]
 
 
 def test_what_a_cache_dropped_before_the_first_contact_is_no_loss() -> None:
