@@ -163,7 +163,7 @@ class _Source:
 class RecoveringSubscriber:
     """Subscriber that queries publishers' caches for what it did not receive. The session outlives it.
 
-    `clock` is monotonic [s]; by it, `news` is when a page last brought a message.
+    `clock` is monotonic [s].
     """
 
     def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
@@ -171,33 +171,28 @@ class RecoveringSubscriber:
         self._waiting, self._bytes = list[Delivery](), 0
         self._sources: dict[tuple[str, int], _Source] = {}
         self._lost: Counter[tuple[str, LossReason]] = Counter()
-        self._asked = self._complete = self.news = -inf  # the last query, and the last that is complete
+        self._asked = self._complete = self._paged = -inf  # the last query, the last complete one, the last news
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
-    def take(self, *, last: bool = False) -> list[Delivery]:
+    def take(self) -> list[Delivery]:
         """Messages that wait, each once, in the order of arrival. Never waits.
 
-        Also queries the caches, if the last query is answered: 25 ms later while pages bring messages, and if these are
-        the `last` messages, else twice a second.
+        Also queries the caches, if the last query is answered: 25 ms later while pages bring messages, else twice a
+        second.
         """
-        paging = self.news >= self._asked
-        due = self._asked + (SOON_S if last or paging else SELDOM_S)
+        paging = self._paged >= self._asked
+        due = self._asked + (SOON_S if paging else SELDOM_S)
         if (paging or self._complete >= self._asked) and self._clock() >= due:
             self._query()
         with self._lock:
             taken, self._waiting, self._bytes = self._waiting, [], 0
         return taken
 
-    @property
-    def recovering(self) -> bool:
-        """Whether an answer is awaited, pages bring messages, or some are lacking that can be reached."""
-        return self.news >= self._asked or not self.complete(self._asked)
-
-    def complete(self, since: float) -> bool:
-        """Whether a query after `since` [s] is answered, and nothing lacks that can be reached."""
+    def complete(self, since: float | None = None) -> bool:
+        """Whether a query after `since` [s], or else the last, is answered, and nothing lacks that can be reached."""
         with self._lock:
             lacks = any(source.lacks and self._age(source) < ANSWER_S for source in self._sources.values())
-            return self._complete >= since and not lacks
+            return self._complete >= (self._asked if since is None else since) and not lacks
 
     def losses(self, *, finished: bool = False) -> list[Loss]:
         """Losses since the last call; if `finished`, all that is lacking is lost."""
@@ -275,7 +270,7 @@ class RecoveringSubscriber:
             self._give_up(source, oldest, "cache")
             source.answered = True
             if any(new):
-                self.news = self._clock()
+                self._paged = self._clock()
 
     def _source(self, key: str, publisher: int, since: int) -> _Source:
         now = self._clock()

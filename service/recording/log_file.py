@@ -18,31 +18,42 @@ from mcap.writer import Writer
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, with_checksum
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
 TRACE_ENCODING: Final = "x-aeroloop-trace"
 
-NO_LIMIT: Final = 1 << 60
+_NO_LIMIT: Final = 1 << 60
 """A chunk size [bytes] that none reaches: `LogFile.commit` alone closes chunks."""
-
-MESSAGE_HEAD: Final = 31
+_MESSAGE_HEAD: Final = 31
 """Bytes of a message record in front of its data."""
+_32_BITS: Final = 0xFFFF_FFFF
 
 
-class _WholeChunks:
-    """A stream for `Writer`; its file grows only by what `flush` has written whole."""
+class LogFile:
+    """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created.
+
+    It is the stream of its own writer, for which `write`, `tell` and `flush` are; `size` is its bytes on the disk.
+    """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0
         self._file = path.open("xb", buffering=0)
         self._pending = bytearray()
-        self.size = 0
+        self._channels: dict[str, int] = {}
+        self._shapes: dict[Shape, int] = {}
+        self._gathered = 0  # bytes of messages in the open chunk
+        self._writer = Writer(self, chunk_size=_NO_LIMIT, enable_data_crcs=True)  # type: ignore[arg-type]  # as a stream
+        self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
 
     def write(self, data: bytes) -> int:
+        """Add bytes to those that `flush` writes."""
         self._pending += data
         return len(data)
 
     def tell(self) -> int:
+        """Where the next bytes will stand."""
         return self.size + len(self._pending)
 
     def flush(self) -> None:
@@ -62,35 +73,6 @@ class _WholeChunks:
         self.size += len(self._pending)
         self._pending.clear()
 
-    def stands_at(self, path: Path) -> bool:
-        with suppress(OSError):
-            return os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
-        return False
-
-    def close(self) -> None:
-        self._file.close()
-
-
-_32_BITS: Final = 0xFFFF_FFFF
-
-
-class LogFile:
-    """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._out = _WholeChunks(path)
-        self._channels: dict[str, int] = {}
-        self._shapes: dict[Shape, int] = {}
-        self._gathered = 0  # bytes of messages in the open chunk
-        self._writer = Writer(self._out, chunk_size=NO_LIMIT, enable_data_crcs=True)  # type: ignore[arg-type]  # it calls write, tell and flush
-        self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
-
-    @property
-    def size(self) -> int:
-        """Bytes on the disk."""
-        return self._out.size
-
     @property
     def full(self) -> bool:
         """Whether the chunk has reached its size."""
@@ -99,7 +81,9 @@ class LogFile:
     @property
     def replaced(self) -> bool:
         """Whether the file was moved or removed while it was written."""
-        return not self._out.stands_at(self.path)
+        with suppress(OSError):
+            return not os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
+        return True
 
     def add(self, received: Delivery, at_ns: int, decoded: Iterable[Decoded] = ()) -> None:
         """Add a message, received at `at_ns` [ns since 1970], to the chunk, and its decoded ones, each under its topic.
@@ -116,6 +100,10 @@ class LogFile:
         """Add a metadata record, under a checksum."""
         self._writer.add_metadata(name, with_checksum(name, entries))
 
+    def add_description(self, key: str, payload: bytes) -> None:
+        """Add a role's last description as metadata."""
+        self.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": payload.decode()})
+
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, which a reader of frames needs."""
         text = files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
@@ -129,22 +117,22 @@ class LogFile:
     def end(self) -> None:
         """Write the last chunk and the index, and close the file. After an OSError only `abandon` is allowed."""
         self._writer.finish()
-        self._out.flush()
-        self._out.close()
+        self.flush()
+        self._file.close()
 
     def abandon(self) -> None:
         """Close the file as it is on the disk; drop what is not written."""
-        self._out.close()
+        self._file.close()
 
     def remove(self) -> None:
         """Close the file and remove it."""
-        self._out.close()
+        self.abandon()
         with suppress(OSError):
             self.path.unlink()
 
     def _add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int) -> None:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
-        self._gathered += MESSAGE_HEAD + len(data)
+        self._gathered += _MESSAGE_HEAD + len(data)
 
     def _channel(self, topic: str, shape: Shape | None) -> int:
         """Id of a topic's channel; a key has the shape of its raw messages."""

@@ -2,7 +2,7 @@
 
 A file is closed at a size or an age. The next one begins with the descriptions, which a reader of it alone needs. When
 the disk refuses, nothing is dropped here: `writable` turns false, the caller keeps its messages, and `tend` tries again
-every second. On a full disk it retries the same file, after any other error it begins a new one.
+every second: on a full disk in the same file, after any other error in a new one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, opening
+from aeroloop.service.logs.mcap_file import RECORDER_METADATA, opening
 from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
@@ -29,8 +29,6 @@ RETRY_S: Final = 1.0
 REMIND_S: Final = 60.0
 """How often a fault that lasts is reported again [s]."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
-LOOK_S: Final = 1.0
-"""How often to check that the file is still there [s]."""
 
 
 class RecorderError(AeroloopError):
@@ -71,10 +69,10 @@ class RollingLog:
         self._base = log_path(place, "aeroloop-%Y%m%d-%H%M%S.mcap")
         self._named_by_time = self._base != place
         self._descriptions: dict[str, bytes] = {}
-        self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
+        self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._part = 0  # of the next file
-        self._began = 0.0
-        self._due = self._check_due = self._retry_due = self._remind_due = 0.0
+        self._due = self._remind_due = self._begun = 0.0
+        self._broken = False  # whether the file cannot be used any more
         try:
             self._base.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._begin()
@@ -106,25 +104,15 @@ class RollingLog:
         """Put a role's description into this file and all later ones."""
         if self._descriptions.get(key) != payload:
             self._descriptions[key] = payload
-            _describe(self._file, key, payload)
+            self._file.add_description(key, payload)
 
-    def tend(self) -> None:
-        """Do what is due: close a chunk, begin a new file, retry the disk."""
+    def tend(self, *, at_once: bool = False) -> None:
+        """Do what is due: close a chunk, retry the disk, begin a new file. If `at_once`, retry before it is due."""
         now = time.monotonic()
-        if self.trouble:
-            if now >= self._retry_due:
-                self._retry()
-        elif now >= self._due:
-            self._due = now + self.settings.chunk_s
+        if now >= self._due or (at_once and self.trouble):
             self._commit()
-            if not self.trouble and now >= self._check_due:
-                self._check_due = now + LOOK_S
+            if not self.trouble:
                 self._rotate_when_due(now)
-
-    def try_again(self) -> None:
-        """Retry a disk that has refused, before the retry is due."""
-        if self.trouble:
-            self._retry()
 
     def close(self, waiting: int = 0) -> None:
         """Write the rest and the index, and close the file; `waiting` messages were not added: the disk refused.
@@ -148,15 +136,25 @@ class RollingLog:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
     def _commit(self) -> None:
+        """Write the chunk, into a new file if this one is broken or gone."""
         try:
-            self._file.commit()
-            self._unwritten.clear()
+            if self.trouble and (self._broken or self._file.replaced):
+                self._next_file()
+            else:
+                self._file.commit()
         except OSError as error:
             self._refused(error)
+            return
+        self._unwritten.clear()
+        self._due = time.monotonic() + self.settings.chunk_s
+        if self.trouble:
+            self.trouble, self._broken = "", False
+            self._report(f"recording again to {self.path}", False)
 
     def _refused(self, error: OSError) -> None:
         now = time.monotonic()
-        self._retry_due = now + RETRY_S
+        self._due = now + RETRY_S
+        self._broken |= error.errno not in FULL
         if not self.trouble or now >= self._remind_due:
             self.trouble = f"{self.path} cannot be written: {error.strerror}"
             self._remind(f"{self.trouble}; messages are kept in memory and written when it can be")
@@ -165,66 +163,35 @@ class RollingLog:
         self._remind_due = time.monotonic() + REMIND_S
         self._report(text, True)
 
-    def _retry(self) -> None:
-        """Write what is pending into the same file or, unless the disk is only full, into a new one."""
-        try:
-            self._commit_or_replace()
-        except OSError as error:
-            self._refused(error)
-            return
-        self._unwritten.clear()
-        self.trouble = ""
-        self._report(f"recording again to {self.path}", False)
-
-    def _commit_or_replace(self) -> None:
-        try:
-            if not self._file.replaced:
-                self._file.commit()
-                return
-        except OSError as error:
-            if error.errno in FULL:
-                raise
-        self._replace_file()
-
-    def _replace_file(self) -> None:
-        """Begin a new file with what the last one has not written."""
-        file = self._begin()
-        try:
-            for entry in self._unwritten:
-                file.add(*entry)
-            file.commit()
-        except OSError:
-            file.remove()
-            raise
-        if self._file.replaced:  # it may stand elsewhere
-            with suppress(OSError):
-                self._file.end()
-        self._file.abandon()
-        self._file = file
-
     def _rotate_when_due(self, now: float) -> None:
         settings, last = self.settings, self._file
         replaced = last.replaced
-        if not replaced and last.size < settings.max_file_mb * 1e6 and now - self._began < settings.max_file_s:
+        if not replaced and last.size < settings.max_file_mb * 1e6 and now - self._begun < settings.max_file_s:
             return
         try:
-            self._file = self._begin()
+            self._next_file()
         except OSError as error:
             if replaced:  # what is written to it now would be gone
                 self._refused(error)
             elif now >= self._remind_due:  # a file that is too large is better than none
                 self._remind(f"no new file can be begun ({error.strerror}), so {self.path} goes on")
-            self._began = now
             return
         if replaced:
             self._report(f"{last.path} was moved or removed while it was written", True)
+        self._remove_oldest()
+
+    def _next_file(self) -> None:
+        """Begin a new file with what the last one has not written, and close that. Raises OSError if none can be."""
+        last, self._file = self._file, self._begin()
+        if self._unwritten:
+            last.abandon()
+            return
         try:
             self._end(last)
         except OSError as error:
             last.abandon()
             what = f"the index of {last.path} could not be written: {error.strerror}"
             self._report(f"{what}; `aeroloop log recover` gives it one", True)
-        self._remove_oldest()
 
     def _end(self, file: LogFile) -> None:
         """Put the descriptions at the file's end, too, and close it. Raises OSError.
@@ -232,11 +199,11 @@ class RollingLog:
         Why twice: a damaged copy must not cost the log.
         """
         for key, description in self._descriptions.items():
-            _describe(file, key, description)
+            file.add_description(key, description)
         file.end()
 
     def _begin(self) -> LogFile:
-        """Create the next file and write its header. Raises OSError."""
+        """Create the next file and write its head and what is unwritten. Raises OSError."""
         path = self._next_path()
         file = LogFile(path)
         try:
@@ -246,12 +213,14 @@ class RollingLog:
             file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
             file.attach_specification(round(started.timestamp() * 1e9))
             for key, description in self._descriptions.items():
-                _describe(file, key, description)
+                file.add_description(key, description)
+            for entry in self._unwritten:
+                file.add(*entry)
             file.commit()
         except OSError:
             file.remove()
             raise
-        self._began = time.monotonic()
+        self._begun = time.monotonic()
         self._part += 1  # a run uses no number twice, even if the file is removed
         return file
 
@@ -292,7 +261,3 @@ class RollingLog:
                 runs = r"aeroloop-\d{8}-\d{6}" if self._named_by_time else re.escape(self._base.stem)
                 return run["part"] == path.stem and re.fullmatch(runs, run["run"]) is not None
         return False
-
-
-def _describe(file: LogFile, key: str, description: bytes) -> None:
-    file.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": description.decode()})

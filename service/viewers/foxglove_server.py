@@ -16,22 +16,22 @@ from typing import Final
 
 import foxglove
 import zenoh
-from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
-from aeroloop.protocol.transport.history import Delivery, RecoveringSubscriber, read_sample
+from aeroloop.protocol.messages.operator import MessageError
+from aeroloop.protocol.transport.history import RecoveringSubscriber, read_sample
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoder, topic_of
+from aeroloop.service.viewers.channels import SHAPES, Decoder, topic_of
 from aeroloop.service.viewers.schemas import Decoded, Shape
 
 log: Final = logging.getLogger("aeroloop")
 
-KEPT: Final = 1024
-"""Descriptions, and per topic events, losses or statuses, that may wait for the next `take`."""
+ROOM: Final = 1024
+"""Events, losses or statuses that may wait to be taken; of streaming topics, one message."""
 BACKLOG: Final = 256
 """Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
 
@@ -47,11 +47,9 @@ class LiveDecoder:
         self._decoder = Decoder(None)  # the rate of `take` bounds it
         self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
         self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
-        self._subscribers = {
-            session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
-            for names, room in ((UNLIMITED, KEPT), (LIMITED.union(topics.FRAMES), 1))
-            for name in sorted(names)
-        }
+        shown = [topic for topic in topics.TOPICS.values() if topic.decoded or topic.kind == "frame"]
+        rooms = {topics.key(topic.name, vehicle): ROOM if topic.decoded == "always" else 1 for topic in shown}
+        self._rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
 
     def take(self) -> Iterator[Decoded]:
         """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
@@ -61,22 +59,17 @@ class LiveDecoder:
                 continue  # recovered after a newer one
             self._described[description.key] = published_ns
             try:
-                self._decoder.configure(Description.model_validate_json(description.payload))
-            except ValidationError:
+                self._decoder.configure(Description.decode(description.payload))
+            except MessageError:
                 log.warning("live: %s carries no description of this version", description.key)
-        for subscriber, room in self._subscribers.items():
+        for ring, room in self._rings:
             for _ in range(room):
-                if (sample := subscriber.try_recv()) is None:
+                if (sample := ring.try_recv()) is None:
                     break
-                yield from self._decode(read_sample(sample))
-
-    def _decode(self, received: Delivery) -> list[Decoded]:
-        address = topics.read_key(received.key)
-        if address is None:
-            return []
-        at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
-        read = self._decoder.frame if address.topic.kind == "frame" else self._decoder.take
-        return read(address, received.payload, at_ns)
+                received = read_sample(sample)
+                if address := topics.read_key(received.key):
+                    at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
+                    yield from self._decoder.take(address, received.payload, at_ns)
 
 
 class FoxgloveServer:

@@ -29,9 +29,9 @@ from typing import Final, NamedTuple
 import zenoh
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.recording.subscriptions import Subscriptions
 from tests.support.namespaces import Hosts
 
 WINDOW_S: Final = 4.0
@@ -60,18 +60,18 @@ def be_a_guest(rendezvous: list[str]) -> None:
     join(NetworkSettings(rendezvous=[]), listen=False).close()  # Zenoh's threads are there from now on
     settings = NetworkSettings(rendezvous=rendezvous, insecure=True)
     session: zenoh.Session | None = None
-    recorded: Subscriptions | None = None
+    recorded: list[RecoveringSubscriber] = []
     say("ready")
     while True:
         if not select.select([sys.stdin], [], [], TAKE_S if recorded else None)[0]:
-            for _ in recorded.take() if recorded else ():
-                pass
+            for subscriber in recorded:
+                subscriber.take()
             continue
         word = os.read(0, 100).decode().strip()
         if word in ("observe", "record"):
             session = join(settings)
             if word == "record":
-                recorded = Subscriptions(session)
+                recorded = [RecoveringSubscriber(session, topics.key(name, "*")) for name in topics.RECORDED]
             else:
                 for topic in ("status", "event", "telemetry", "truth"):
                     session.declare_subscriber(topics.key(topic, "*"), lambda _: None)

@@ -167,8 +167,3 @@ RAW = {
     "trace": batch("plant", [(NOW, Sent.FRAME, measurement(0, 0, 0, 0, 0, 0))]),
 }
 """A message of every topic that is decoded."""
-
-
-def decode(decoder: Decoder, name: str, payload: bytes, at_ns: int) -> list[Decoded]:
-    """What a decoder gives for a message, a frame or not."""
-    return (decoder.frame if name in topics.FRAMES else decoder.take)(address(name), payload, at_ns)

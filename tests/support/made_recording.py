@@ -50,7 +50,6 @@ class Clock:
 
     def __init__(self) -> None:
         self.now = 1000.0
-        self.logs: list[RollingLog] = []  # that run by it
 
 
 class Disk:
@@ -108,7 +107,6 @@ class Recording:
         self.log = RollingLog(
             RecorderSettings.model_validate(settings), lambda *reported: self.reported.append(reported)
         )
-        clock.logs.append(self.log)
         self.log.add_description(story.key, story.description)
         self._decoder = Decoder(25.0)
         self._decoder.configure(Description.model_validate_json(story.description))

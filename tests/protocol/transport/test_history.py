@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -218,14 +219,20 @@ def test_a_loss_says_what_is_known() -> None:
     assert made.subscriber.losses() == [Loss(key=KEY, count=10, reason="gone")]
 
 
-def test_what_cannot_be_reached_but_may_have_more_is_named() -> None:
+def test_what_cannot_be_reached_but_may_have_more_is_named_and_not_waited_for() -> None:
     made = Made(10)
-    made.receive(made.publish())
-    found = []
+    for number in (0, 2):
+        made.receive(number)
+    found, complete = [], []
     for pause_s in (ANSWER_S - 0.1, 1.0, KEPT_S):
+        made.take()
+        made.queries.pop()[1].drop()  # answered by none
+        complete.append(made.subscriber.complete())
         made.now += pause_s
+        complete.append(made.subscriber.complete())
         found.append(made.subscriber.silent())
     assert found == [{}, {KEY: pytest.approx(ANSWER_S + 0.9)}, {}]
+    assert complete == [False, False, False, True, True, True]
 
 
 def test_what_a_cache_dropped_before_the_first_contact_is_no_loss() -> None:
@@ -359,6 +366,31 @@ def test_a_subscriber_that_comes_late_or_again_gets_everything_that_is_kept_once
         assert before_ns <= stamps[0]
         assert stamps == sorted(stamps)
         session.close()
+
+
+def test_messages_published_while_a_link_is_set_up_do_not_hide_what_was_published_before(network: Gathering) -> None:
+    """The publisher is met by gossip, in the midst of a thousand messages a second."""
+    network.join()  # holds the rendezvous
+    publisher, over = CachedPublisher(network.join(), KEY, per_s=1000), threading.Event()
+
+    def publish() -> None:
+        while not over.wait(0.001):
+            publisher.put(b"")
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        time.sleep(0.5)
+        subscriber = RecoveringSubscriber(network.join(), ANY)
+        received = collect(subscriber, 500)
+    finally:
+        over.set()
+        thread.join()
+    publisher.put(b"last")
+    while received[-1].payload != b"last" or len(received) <= received[-1].number:
+        received = collect(subscriber, len(received) + 1, received)
+    assert [each.number for each in received] == list(range(len(received)))
+    assert subscriber.losses() == []
 
 
 def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:

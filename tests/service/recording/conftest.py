@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -52,11 +51,9 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch, disk: Disk) -> Iterator[Clock]:
+def clock(monkeypatch: pytest.MonkeyPatch, disk: Disk) -> Clock:
     """With a disk that is not a real one."""
     del disk
     clock = Clock()
     monkeypatch.setattr(rolling, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    yield clock
-    for log in clock.logs:
-        log._file.abandon()  # of a test that failed, it may be open still
+    return clock

@@ -73,20 +73,6 @@ def _header_size(path: Path) -> int:
     return at
 
 
-def test_what_is_on_a_full_disk_can_be_read_as_it_is(tmp_path: Path, story: EventLog, clock: Clock, disk: Disk) -> None:
-    """No half of a chunk stays behind, and the room that it took is given back."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
-    disk.room = recording.log.path.stat().st_size + 10_000
-    recording.take(story.messages[:400])
-    assert not recording.log.writable
-    damages: list[Damage] = []
-    assert Message in list(map(type, records(tmp_path / "a.mcap", damages)))
-    assert [damage.what for damage in damages] == ["the file ends here, without its index"]
-    disk.room = EVERYTHING
-    recording.wait(rolling.RETRY_S)
-    recording.log.close()
-
-
 def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
     tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
@@ -97,58 +83,57 @@ def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
     assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:200])
 
 
-def test_while_a_disk_is_full_it_is_tried_once_a_second_and_reported_once(
+def test_while_a_disk_is_full_it_is_tried_once_a_second_reported_once_and_what_is_on_it_can_be_read(
     tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
+    """No half of a chunk stays behind, and the room that it took is given back."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
-    disk.room = 0
-    recording.take(story.messages[:100])
+    disk.room = recording.log.path.stat().st_size + 10_000
+    recording.take(story.messages[:400])
     assert not recording.log.writable
-    before = disk.writes
+    damages: list[Damage] = []
+    assert Message in list(map(type, records(tmp_path / "a.mcap", damages)))
+    assert [damage.what for damage in damages] == ["the file ends here, without its index"]
+    disk.room, before = 0, disk.writes
     for _ in range(100):
         recording.wait(0.1)
     assert 9 <= disk.writes - before <= 10
     assert len(recording.reported) == 1
     disk.room = EVERYTHING
-    recording.wait(1.0)
-    recording.log.close()
+    recording.log.tend(at_once=True)  # as a recorder that is stopped does
+    recording.wait(0.0)
+    recording.log.close(len(recording.waiting))
+    assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:400])
 
 
-@pytest.mark.parametrize(
-    "first", [None, (errno.EIO, errno.ENOSPC), (errno.EIO, 0, errno.ENOSPC)], ids=["it", "its head", "its messages"]
-)
-def test_a_broken_disk_is_left_for_a_new_file_and_nothing_is_lost_or_doubled(
-    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk, first: tuple[int, ...] | None
+@pytest.mark.parametrize("errors", [(errno.EIO,), (errno.EIO, errno.ENOSPC), (errno.ENOSPC, None)])
+def test_a_file_that_cannot_be_used_is_left_for_a_new_one_and_nothing_is_lost_or_doubled(
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk, errors: tuple[int | None, ...]
 ) -> None:
-    """Even if at first there is no room for the new file: what came to nothing is removed."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
+    """On a broken disk; also if at first there is no room for the new file: what came to nothing is removed.
+
+    And where the file was removed (None) while the disk was full: what is not written yet goes into a new one.
+    """
+    old, recovered = tmp_path / "a.mcap", tmp_path / "recovered"
+    recording = Recording(clock, story, path=old, chunk_s=0.05)
     recording.take(story.messages[:330])
-    disk.broken = errno.EIO
-    recording.take(story.messages[330:500])
-    recording.wait(2.0)
-    assert not recording.log.writable
-    if first:
-        _errors(disk, *first)
-        recording.wait(1.0)
+    for error in errors:
+        if error is None:
+            recover(old, recovered)
+            old.unlink()
+        else:
+            disk.broken = error
+        recording.take(story.messages[330:500] if error == errors[0] else [])
+        recording.wait(2.0)
         assert not recording.log.writable
-        assert [path.name for path in in_order(tmp_path)] == ["a.mcap"]
-    _errors(disk, errno.EIO, 0)  # the old file's, and then none
+        assert in_order(tmp_path) == [old][: error is not None]
+    disk.broken = 0
     recording.wait(1.0)
     recording.take(story.messages[500:])
     recording.log.close()
-    old, new = in_order(tmp_path)
-    recover(old, tmp_path / "recovered")
-    assert every_message([tmp_path / "recovered", new]) == numbered(story.messages)
-
-
-def _errors(disk: Disk, *errors: int) -> None:
-    """What the next writes give, and all that follow as the last one does."""
-    coming = list(errors)
-
-    def changes(_: int) -> None:
-        disk.broken = coming.pop(0) if len(coming) > 1 else coming[0]
-
-    disk.changes = changes
+    if old.exists():
+        recover(old, recovered)
+    assert every_message([recovered, tmp_path / "a-0001.mcap"]) == numbered(story.messages)
 
 
 def test_a_file_that_is_moved_or_removed_is_reported_and_another_begun(
@@ -157,10 +142,10 @@ def test_a_file_that_is_moved_or_removed_is_reported_and_another_begun(
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
     recording.take(story.messages[:100])
     (tmp_path / "a.mcap").rename(tmp_path / "moved")
-    recording.wait(rolling.LOOK_S)
+    recording.wait(1.0)
     recording.take(story.messages[100:200])
     (tmp_path / "a-0001.mcap").unlink()
-    recording.wait(rolling.LOOK_S)
+    recording.wait(1.0)
     recording.take(story.messages[200:300])
     recording.log.close()
     assert recording.reported_bad() == [
@@ -178,7 +163,7 @@ def test_while_the_folder_is_gone_nothing_counts_as_recorded_and_a_reminder_come
     recording = Recording(clock, story, path=folder / "a.mcap", chunk_s=0.05)
     recording.take(story.messages[:100])
     folder.rename(tmp_path / "moved")
-    recording.wait(rolling.LOOK_S)
+    recording.wait(1.0)
     recording.take(story.messages[100:200])
     why = f"{folder / 'a.mcap'} cannot be written: {os.strerror(errno.ENOENT)}"
     assert recording.log.trouble == why
@@ -250,7 +235,7 @@ def test_the_end_on_a_full_disk_is_reported_in_one_line_and_what_was_written_can
     size = (tmp_path / "a.mcap").stat().st_size
     disk.room = size
     recording.take(story.messages[250:270])
-    recording.log.try_again()
+    recording.log.tend(at_once=True)
     with pytest.raises(RecorderError) as refused:
         recording.log.close(waiting=3)
     written = recover(tmp_path / "a.mcap", tmp_path / "recovered")
@@ -278,17 +263,3 @@ def test_the_last_messages_are_written_even_where_the_index_has_no_room(
     disk.room = EVERYTHING
     recover(tmp_path / "a.mcap", tmp_path / "recovered")
     assert every_message([tmp_path / "recovered"]) == numbered(story.messages[:250])
-
-
-def test_a_disk_that_has_room_again_is_tried_before_the_end(
-    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
-) -> None:
-    """A recorder that is stopped need not wait for the next try."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
-    disk.room = 0
-    recording.take(story.messages[:100])
-    disk.room = EVERYTHING
-    recording.log.try_again()
-    recording.wait(0.0)
-    recording.log.close(len(recording.waiting))
-    assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:100])

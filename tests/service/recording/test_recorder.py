@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,15 +22,14 @@ from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport import history
-from aeroloop.protocol.transport.history import SOON_S, CachedPublisher, attachment
+from aeroloop.protocol.transport.history import CachedPublisher, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
-from aeroloop.service.recording import backlog, rolling
+from aeroloop.service.recording import recorder, rolling
 from aeroloop.service.recording.log_file import TRACE_ENCODING
-from aeroloop.service.recording.recorder import MANY, WORK_EVERY_S, Recorder
+from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
-from aeroloop.service.recording.subscriptions import Subscriptions
 from aeroloop.service.settings import RecorderSettings
 from tests.service.recording.conftest import CHANGES
 from tests.support.cable import Cable
@@ -42,23 +42,17 @@ START_NS = 1_800_000_000_000_000_000
 
 
 class Running:
-    """A recorder in a thread of its own.
-
-    Attributes:
-        full: Whether its disk is full.
-        error: What it ended with, if it did not end well.
-    """
+    """A recorder in a thread of its own; `full` is whether its disk is, `error` what it ended with."""
 
     def __init__(
         self, path: Path, gathering: Gathering, network: NetworkSettings | None = None, **settings: object
     ) -> None:
-        self.path = path
-        self.full = False
+        self.path, self.full = path, False
         self.error: Exception | None = None
-        self._write = os.pwrite
         self.role = Node("recorder", "aero", network or gathering.settings, {})
         options = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
         self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **options}))
+        self._write = os.pwrite
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -72,6 +66,10 @@ class Running:
         if self.full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return self._write(fd, data, offset)
+
+    def await_written(self, count: int = 3) -> None:
+        """Wait until so many messages are written; two are the recorder's own."""
+        eventually(f"{count} messages", lambda: self.recorder.log.written >= count)
 
     def end(self) -> None:
         """Stop it and wait until its log is closed."""
@@ -94,12 +92,17 @@ class Running:
         return [data for _, data in sorted((number, data) for topic, number, data in self.messages() if topic == key)]
 
     def numbers(self) -> list[int]:
-        return [int.from_bytes(data, "big") for data in self.of(KEY)]
+        """Numbers of the recorded messages of `KEY`, ascending."""
+        return sorted(number for topic, number, _ in self.messages() if topic == KEY)
 
     def losses(self) -> list[tuple[str, int, str]]:
         """Key, how many and why, in the log."""
         losses = [Loss.model_validate_json(data) for data in self.of("aeroloop/aero/loss")]
         return [(loss.key, loss.count, loss.reason) for loss in losses]
+
+    def statuses(self) -> list[Status]:
+        """The recorder's own, in the log."""
+        return [Status.model_validate_json(data) for data in self.of("aeroloop/aero/status/recorder")]
 
 
 @pytest.fixture
@@ -113,8 +116,8 @@ Record = Callable[..., Running]
 
 @pytest.fixture
 def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
-    """Starts recorders: in memory there is room for fifty messages, and the disk is tried ten times a second."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", ROOM)
+    """Starts recorders: on a full disk fifty messages may wait, and it is tried ten times a second."""
+    monkeypatch.setattr(recorder, "WAITING_BYTES", ROOM * (recorder.OVERHEAD + 1))
     monkeypatch.setattr(rolling, "RETRY_S", 0.1)
     running: list[Running] = []
 
@@ -130,17 +133,16 @@ def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch
 
 
 class Publisher:
-    """Publishes messages with a number, from a cache of 65 000."""
+    """Publishes messages from a cache of 65 000."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.session = session
+        self.session, self.count = session, 0
         self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
-        self._next = 0
 
-    def send(self, until: int) -> None:
-        for number in range(self._next, until):
-            self._publisher.put(number.to_bytes(4, "big"))
-        self._next = until
+    def send(self, until: int, size: int = 1) -> None:
+        for _ in range(self.count, until):
+            self._publisher.put(bytes(size))
+        self.count = until
 
 
 @pytest.fixture
@@ -152,28 +154,12 @@ SIZE = 1500
 """Bytes of a message, as of a trace's batch."""
 
 
-def numbers(running: Running, key: str = KEY) -> list[int]:
-    """What a recorder recorded of large messages, in the order of arrival."""
-    return [number for topic, number, _ in running.messages() if topic == key]
-
-
-def statuses(gathering: Gathering) -> list[Status]:
-    """The recorder's, as they come."""
-    found: list[Status] = []
-    gathering.join().declare_subscriber(
-        "aeroloop/aero/status/recorder",
-        lambda sample: found.append(Status.model_validate_json(sample.payload.to_bytes())),
-    )
-    return found
-
-
 # What is recorded
 
 
 def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and_every_file_can_be_read_alone(
-    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+    gathering: Gathering, record: Record
 ) -> None:
-    monkeypatch.setattr(rolling, "LOOK_S", 0.0)
     session, settings = gathering.join(), load()
     publishers: dict[str, CachedPublisher] = {}
     published: dict[str, list[bytes]] = {}
@@ -196,12 +182,28 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         running.end()
         assert {key: running.of(key) for key in published} == published
         assert running.losses() == []
-        with parts(running.path)[-1].open("rb") as file:
-            metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-        descriptions = {
-            entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA
-        }
-        assert descriptions[description] == published[description][0]
+        assert descriptions(parts(running.path)[-1])[description] == published[description][0]
+
+
+def descriptions(path: Path) -> dict[str, bytes]:
+    """The last description of each key that a file has as metadata."""
+    with path.open("rb") as file:
+        metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
+    return {entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA}
+
+
+def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
+    gathering: Gathering, record: Record
+) -> None:
+    running, key = record(), topics.key("description", "aero", role="plant")
+    declared = gathering.join().declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
+    for number, rate_hz in ((1, 200), (0, 100)):
+        payload = description_of(load(None, [f"loop.rate_hz={rate_hz}"]), "plant").encode()
+        declared.put(payload, attachment=attachment(START_NS + number, 4711, number))
+    running.await_written(4)
+    running.end()
+    assert b'"rate_hz":200.0' in descriptions(running.path)[key]
 
 
 def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishers_numbers(
@@ -219,10 +221,10 @@ def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishe
         if (said.topic, said.role) == ("trace", "plant")
     ]
     running = record(decoded_hz=10_000.0)
-    eventually("the description", lambda: running.recorder.log.written > 2)
+    running.await_written()
     for batch in batches:
         trace.put(batch)
-    eventually("the trace", lambda: running.recorder.log.written > 4)
+    running.await_written(5)
     running.end()
     times, raw = [], []
     with running.path.open("rb") as file:
@@ -244,93 +246,51 @@ def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_mes
 ) -> None:
     running = record()
     publisher.send(1)
-    eventually("the first", lambda: running.recorder.log.written > 2)
+    running.await_written()
     publisher.send(20_000)
     running.end()
     assert running.numbers() == list(range(20_000))
     assert running.losses() == []
 
 
-class Waits(threading.Event):
-    """An event that keeps how long it was waited for [s]."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.asked: list[float | None] = []
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.asked.append(timeout)
-        return super().wait(timeout)
-
-
-@pytest.mark.parametrize("recovering", [False, True])
-def test_the_next_messages_are_taken_soon_while_many_come_or_caches_are_queried_and_else_seldom(
-    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch, recovering: bool
-) -> None:
-    """What waits in a ring may hold far more memory than its own size; of a cache a page is taken at a time."""
-    monkeypatch.setattr(Subscriptions, "recovering", recovering)
-    running, waits = record(), Waits()
-    running.role.stop = waits
-    publisher.send(1)
-    eventually("the first", lambda: running.recorder.log.written > 2)
-    if recovering:
-        eventually("soon", lambda: waits.asked[-1] == SOON_S)
-        monkeypatch.setattr(Subscriptions, "recovering", False)
-        eventually("as seldom as before", lambda: waits.asked[-1] == WORK_EVERY_S)
-        waits.asked.clear()
-    assert set(waits.asked) <= {WORK_EVERY_S}
-    publisher.send(2 * MANY)
-    eventually("soon", lambda: SOON_S in waits.asked)
-    eventually("quiet", lambda: waits.asked[-1] == WORK_EVERY_S)
-
-
-def test_a_recorder_that_ends_takes_what_caches_still_hold(
-    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
     """It ends as soon as its cable is back and a new message has come: 2.5 MB were published meanwhile."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
     port, count = free_port(), 1700
-    far = gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1))
-    published = CachedPublisher(far, KEY, per_s=1000)
+    published = Publisher(gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1)))
     with Cable(port) as cable:
         alone = NetworkSettings(rendezvous=[], listen=[], gossip=False, connect=[cable.endpoint])
         running = record(network=alone)
-        published.put(bytes(SIZE))
-        eventually("the first", lambda: running.recorder.log.written > 2)
+        published.send(1)
+        running.await_written()
         cable.cut()
-        for _ in range(count):
-            published.put(bytes(SIZE))
+        published.send(count, SIZE)
         before = running.recorder.log.written
         cable.mend()
 
         def received() -> bool:
-            published.put(bytes(SIZE))
+            published.send(published.count + 1)
             return running.recorder.log.written > before + 5
 
         eventually("a new one", received)
         running.end()
-    found = numbers(running)
-    assert len(found) == len(set(found)) > count
-    assert sorted(found) == list(range(max(found) + 1))
+    found = running.numbers()
+    assert len(found) > count
+    assert found == list(range(len(found)))
     assert running.losses() == []
 
 
 def test_a_recorder_that_comes_again_begins_with_what_its_older_file_lacks(
-    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+    record: Record, publisher: Publisher
 ) -> None:
     """The publisher ends soon after: what it published last is there."""
-    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
-    session = gathering.join()
-    published = CachedPublisher(session, KEY, per_s=1000)
-    for _ in range(2000):
-        published.put(bytes(SIZE))
+    publisher.send(2000, SIZE)
     running = record()
-    eventually("some", lambda: running.recorder.log.written > 200)
-    published.put(bytes(SIZE))
-    eventually("the newest", lambda: running.recorder.log.written > 300)
-    session.close()
+    running.await_written(200)
+    publisher.send(2001)
+    running.await_written(300)
+    publisher.session.close()
     running.end()
-    found = numbers(running)
+    found = running.numbers()
     assert set(range(1850, 2001)) <= set(found)
     assert [loss for loss in running.losses() if loss[0] == KEY] in ([], [(KEY, 2001 - len(found), "gone")])
 
@@ -343,14 +303,18 @@ def test_a_recorder_that_ends_names_the_traces_that_it_cannot_reach(
     session, key = gathering.join(), topics.key("trace", "aero", role="plant")
     published, running = CachedPublisher(session, key, per_s=10), record()
     published.put(b"")
-    eventually("the first", lambda: running.recorder.log.written > 2)
+    running.await_written()
     session.close()
+    closed = time.monotonic()
     time.sleep(1.0)
     running.end()
-    said = f"nothing of {key} was received for 1 s: what it has published since is not in the log"
-    *_, last = running.of("aeroloop/aero/status/recorder")
-    assert Status.model_validate_json(last).notes == [said]
-    assert said in str(running.of("aeroloop/aero/event/recorder")[-1])
+    (note,) = running.statuses()[-1].notes
+    age_s = re.fullmatch(
+        f"nothing of {key} was received for (\\d+) s: what it has published since is not in the log", note
+    )
+    assert age_s is not None
+    assert 1 <= int(age_s[1]) <= time.monotonic() - closed + 1
+    assert note in str(running.of("aeroloop/aero/event/recorder")[-1])
 
 
 def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, publisher: Publisher) -> None:
@@ -372,7 +336,7 @@ def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothi
     publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
-    eventually("all", lambda: running.recorder.log.written >= len(names) + 2)
+    running.await_written(len(names) + 2)
     running.end()
     assert running.error is None
     recorded = {key for key, _, data in running.messages() if data == b"\xff\x00"}
@@ -386,34 +350,33 @@ def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_
     record: Record, publisher: Publisher, gathering: Gathering
 ) -> None:
     """Every message is in the log or in the count of those that are not; none is in both, and none is lost twice."""
-    running = record()
-    reported = statuses(gathering)
+    running, reported = record(), list[Status]()
+    gathering.join().declare_subscriber(
+        "aeroloop/aero/status/recorder",
+        lambda sample: reported.append(Status.model_validate_json(sample.payload.to_bytes())),
+    )
     publisher.send(1)
-    eventually("the first", lambda: running.recorder.log.written > 2)
+    running.await_written()
     running.full = True
     publisher.send(2)
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(502)
+    eventually("a full backlog", lambda: len(running.recorder.waiting) > ROOM // 2)
+    reported.clear()
     eventually("its word", lambda: any(status.state == "not recording" and status.cause for status in reported))
-    eventually("a full backlog", lambda: len(running.recorder._backlog) == ROOM)
     running.full = False
-    eventually(
-        "its word",
-        lambda: (
-            reported[-1].state == "recording" and any("could not be written" in note for note in reported[-1].notes)
-        ),
-    )
+    said = "could not be written"
+    eventually("its word", lambda: reported[-1].state == "recording" and said in str(reported[-1].notes))
     publisher.send(510)
     running.end()
-    numbers = running.numbers()
-    lost = sum(count for key, count, reason in running.losses() if key == KEY and reason == "disk")
+    numbers, losses = running.numbers(), running.losses()
+    lost = sum(count for key, count, reason in losses if key == KEY)
     assert numbers == sorted(set(numbers))
     assert numbers[-8:] == list(range(502, 510))
     assert lost == 510 - len(numbers)
     assert 502 - ROOM < lost + 3 <= 502
-    assert {reason for _, _, reason in running.losses()} == {"disk"}
-    total = sum(count for _, count, _ in running.losses())
-    eventually("the count in its status", lambda: reported[-1].lost == total)
+    assert {reason for _, _, reason in losses} == {"disk"}
+    assert running.statuses()[-1].lost == sum(count for _, count, _ in losses)
     assert running.error is None
 
 
@@ -429,8 +392,7 @@ def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gatheri
     assert running.losses() == [(KEY, 996, "gone")]
     *_, said = running.of("aeroloop/aero/event/recorder")
     assert f"996 messages of {KEY} are not in the log: not received, and their publisher does not answer" in str(said)
-    *_, last = running.of("aeroloop/aero/status/recorder")
-    assert Status.model_validate_json(last).notes[0].startswith("996 messages lost: not received")
+    assert running.statuses()[-1].notes[0].startswith("996 messages lost: not received")
 
 
 # The end, with a disk that refuses
@@ -445,7 +407,7 @@ def test_a_recorder_that_is_stopped_when_the_disk_has_room_again_writes_what_wai
     publisher.send(1)
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(30)
-    eventually("all", lambda: len(running.recorder._backlog) >= 29)
+    eventually("all", lambda: len(running.recorder.waiting) >= 29)
     running.full = False
     running.end()
     assert running.error is None
@@ -465,4 +427,3 @@ def test_a_recorder_that_is_stopped_while_the_disk_is_full_reports_how_much_is_l
     count, _, rest = str(running.error).partition(" ")
     assert int(count) >= 29
     assert rest.startswith(f"messages and the index of {running.path} could not be written")
-    running.recorder.log._file.abandon()

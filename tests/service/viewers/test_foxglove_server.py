@@ -1,7 +1,4 @@
-"""Live server with the Foxglove protocol: bounded queues, and no effect of a viewer on the loop.
-
-The loop runs in this process: the plant's and the controller's own code, over Zenoh on loopback.
-"""
+"""Live server with the Foxglove protocol, over Zenoh on loopback: what is shown, at which pace, to whom."""
 
 from __future__ import annotations
 
@@ -13,28 +10,26 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from math import degrees
+from itertools import count
+from math import degrees, radians
 from queue import Queue
 
 import pytest
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.protocol.messages.models import Claim, Event, Status
+from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.wire.attitude import Quaternion, angle, distance
+from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.controller import Controller
-from aeroloop.service.daemon.telemetry import telemetry_of
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
 from aeroloop.service.viewers.schemas import Decoded
+from tests.support.decoded import NOW, RAW, STATUS, about, measurement, telemetry
 from tests.support.viewer_double import PATIENCE_S, Shown, Viewer, orientation
 
-NOW = 1_800_000_000_000_000_000
 TOPICS = {f"/aero/{name}" for name in SHAPES}
 
 
@@ -62,21 +57,18 @@ def serving(network: NetworkSettings, rate_hz: float = 100.0) -> Iterator[str]:
 
 
 class Loop:
-    """A closed loop over Zenoh, paced by a timer: a context. It starts a new session whenever it is asked to.
+    """A moving plant and its controller over Zenoh, paced by a timer: a context.
 
-    Attributes:
-        attitudes: Where the body was at each tick.
-        errors: The controller's own error at each tick [deg], by time on the law's clock [s].
+    `attitudes` are those the body had; the tracking error at time t on the law's clock [s] is t degrees.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._stop = threading.Event()
+        self._plant, self._controller = (
+            Node(role, "aero", settings.network, settings.description()) for role in ("plant", "controller")
+        )
+        self._period, self._stop = settings.loop.period, threading.Event()
         self._thread = threading.Thread(target=self._run)
-        self._plant = Node("plant", "aero", settings.network, settings.description())
-        self._controller = Node("controller", "aero", settings.network, settings.description())
         self.attitudes: list[Quaternion] = []
-        self.errors: dict[float, float] = {}
 
     def __enter__(self) -> Loop:
         self._plant.announce()
@@ -94,29 +86,18 @@ class Loop:
         self._plant.publish("event", Event(role="plant", kind="tripped", text="as it was asked to"))
 
     def _run(self) -> None:
-        settings, wire, loop = self._settings, self._settings.wire, self._settings.loop
-        body = settings.plant.build(loop.period)
-        endpoint = Endpoint(body, wire, loop.period_ns, lockstep=True)
-        endpoint.claim(
-            Claim(controller="c", session="s1", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
-        )
-        controller = Controller(wire, settings.law, settings.reference, loop.period)
-        measurement, k = endpoint.tick(None, 0), 0
         measured = self._plant.zenoh.declare_publisher(key("measurement", "aero", session="s1"))
         commanded = self._controller.zenoh.declare_publisher(key("command", "aero", session="s1"))
-        while not self._stop.wait(loop.period):
-            assert measurement is not None
-            self.attitudes.append(body.truth().attitude)
-            measured.put(measurement)
-            command = controller.tick(measurement, k)
-            assert command is not None
-            self.errors[round(k * loop.period, 6)] = degrees(angle(*controller.attitude_error))
-            commanded.put(command)
-            self._controller.publish("telemetry", telemetry_of(controller, "s1"))
+        for k in count():
+            if self._stop.wait(self._period):
+                return
+            self.attitudes.append(about(3, 0.01 * k % 3))
+            measured.put(measurement(*sent_vector(self.attitudes[-1]), 0, 0, 0.5))
+            commanded.put(RAW["command"])
+            error = about(1, radians(k * self._period))
+            self._controller.publish("telemetry", telemetry(error).model_copy(update={"tick": k}))
             if k % 20 == 0:
-                status = Status(role="plant", state="driven", uptime_s=1.0, ticks=k, rate_hz=200.0, skipped=0)
-                self._plant.publish("status", status)
-            measurement, k = endpoint.tick(command, k + 1), k + 1
+                self._plant.publish("status", STATUS)
 
 
 def nearest_deg(shown: Shown, attitudes: list[Quaternion]) -> float:
@@ -142,7 +123,7 @@ def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all_as_the_body_mo
                 for _ in range(5):
                     assert nearest_deg(viewer.first("/aero/pose"), loop.attitudes) < quantum_deg
                 tracking = json.loads(viewer.first("/aero/tracking").data)
-                assert tracking["error_deg"] == pytest.approx(loop.errors[tracking["time_s"]], abs=1e-3)
+                assert tracking["error_deg"] == pytest.approx(tracking["time_s"], abs=1e-3)
             loop.trip()
             assert b"tripped: as it was asked to" in early.first("/aero/log").data
             assert early.first("/aero/scene").data

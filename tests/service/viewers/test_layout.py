@@ -46,11 +46,6 @@ def paths(tree: dict[str, Any]) -> list[str]:
     return [path["value"] for panel in tree["configById"].values() for path in panel.get("paths", [])]
 
 
-def topics_named(tree: dict[str, Any]) -> set[str]:
-    panels = tree["configById"].values()
-    return {name for panel in panels for name in [*panel.get("topics", {}), panel.get("topicToRender")] if name}
-
-
 def leaves(node: Any) -> Iterator[str]:
     if isinstance(node, str):
         yield node
@@ -63,34 +58,26 @@ def leaves(node: Any) -> Iterator[str]:
 
 @pytest.mark.parametrize("vehicle", ["aero", "bench.2"])
 def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
+    """A topic with a dot in it stands in quotes."""
     found = paths(made(vehicle, 3))
     for path in found:
         parts = re.fullmatch(r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)', path)
         assert parts is not None, path
-        assert parts["vehicle"] == vehicle
+        assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
         assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
     shown = {path.rpartition(".")[2] for path in found}
     assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "latency_p99_us", "state"} <= shown
 
 
-def test_a_topic_with_a_dot_in_it_stands_in_quotes() -> None:
-    assert '"/bench.2/tracking".error_deg' in paths(made("bench.2"))
-    assert "/aero/tracking.error_deg" in paths(made("aero"))
-
-
 def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws() -> None:
-    tree = made()
-    assert topics_named(tree) <= {f"/aero/{name}" for name in SHAPES}
-    (body,) = (panel for name, panel in tree["configById"].items() if name.startswith("3D!"))
+    panels = made()["configById"]
+    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
     assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
     assert SHAPES["scene"].name == "foxglove.SceneUpdate"
-    (log,) = (panel for name, panel in tree["configById"].items() if name.startswith("RosOut!"))
+    assert (body["followTf"], body["followMode"]) == ("aero", "follow-position")
+    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
     assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"
-
-
-def test_the_camera_follows_the_frame_that_the_body_hangs_in() -> None:
-    (body,) = (panel for name, panel in made("x")["configById"].items() if name.startswith("3D!"))
-    assert (body["followTf"], body["followMode"]) == ("x", "follow-position")
 
 
 def test_only_settings_that_a_panel_has_are_made_and_every_panel_has_its_place() -> None:

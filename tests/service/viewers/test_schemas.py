@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED
+from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.schemas import json_shape, plain_schema
-from tests.support.decoded import NOW, RAW, STATUS, address, configured, decode, said
+from tests.support.decoded import NOW, RAW, STATUS, address, configured, said
 from tests.support.viewer_double import fields
 
 
@@ -30,8 +30,10 @@ TYPES: dict[str, type | tuple[type, ...]] = {"boolean": bool, "string": str, "nu
 
 def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:
     decoder = configured()
-    assert set(RAW) == LIMITED | UNLIMITED | {"trace", *topics.FRAMES}
-    given = [shown for name, payload in RAW.items() for shown in decode(decoder, name, payload, NOW)]
+    assert set(RAW) == {
+        topic.name for topic in topics.TOPICS.values() if topic.decoded or topic.kind in ("frame", "trace")
+    }
+    given = [shown for name, payload in RAW.items() for shown in decoder.take(address(name), payload, NOW)]
     given += decoder.take(address("status", "controller"), STATUS.encode(), NOW)
     given += decoder.take(address("status", "recorder"), STATUS.encode(), NOW)
     assert {shown.topic: shown.shape for shown in given} == {f"/aero/{name}": shape for name, shape in SHAPES.items()}
