@@ -11,6 +11,7 @@ takes what caches still hold.
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
@@ -39,6 +40,9 @@ AT_ONCE: Final = 2000
 WAITING_BYTES: Final = 200_000_000
 """Of messages that wait while the disk refuses, with `OVERHEAD` for each; the newest that find no room are lost."""
 OVERHEAD: Final = 600
+
+_malloc_trim: Final = getattr(ctypes.CDLL(None), "malloc_trim", None)
+"""Gives freed memory back to the system, malloc_trim(3): after a flood, malloc would keep it. None without glibc."""
 
 END_S: Final = 8.0
 """Longest time for what caches hold when recording ends [s]; a service manager kills after 10."""
@@ -79,6 +83,8 @@ class Recorder:
                 if time.monotonic() >= status_due:
                     self._publish_losses(self._losses())
                     self._publish_status()
+                    if _malloc_trim is not None:
+                        _malloc_trim(0)
                     status_due = time.monotonic() + STATUS_EVERY_S
                 self.log.tend()
                 stopped = self._role.stop.wait(self._pause_s())

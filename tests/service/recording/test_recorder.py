@@ -317,9 +317,14 @@ def test_a_recorder_that_ends_names_the_traces_that_it_cannot_reach(
     assert note in str(running.of("aeroloop/aero/event/recorder")[-1])
 
 
-def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, publisher: Publisher) -> None:
+def test_the_last_message_in_a_log_is_that_recording_stopped(
+    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "STATUS_EVERY_S", 3600.0)  # none but the first and the last
     running = record()
+    running.await_written(3)  # its description, event and status
     publisher.send(2)
+    running.await_written(5)  # what is received after the last status was taken would not be counted in it
     running.end()
     key, _, said = running.messages()[-1]
     assert key == "aeroloop/aero/status/recorder"
