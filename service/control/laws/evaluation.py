@@ -141,6 +141,31 @@ def _parts(law: ExpressionLaw[Any]) -> _Parts:
     )
 
 
+def python_law_function(law: Law[Any]) -> ca.Function:
+    """One tick around a law in Python, as `law_function`.
+
+    What the law has computed are two more inputs, law_voltages and law_state: they are u and state_next.
+    """
+    states, gains = sum(map(len, initial_state(law).values())), sum(map(len, configured_gains(law).values()))
+    sizes = dict(zip(INPUTS, (4, states, gains, 3, 3, 4, 3, 3), strict=True))
+    given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
+    u, after = ca.SX.sym("law_voltages", law.actuators), ca.SX.sym("law_state", states)
+    q, (eps, omega, q_d, omega_d) = ca.SX.sym("q", 4), (given[name] for name in ("eps", "omega", "q_d", "omega_d"))
+    attitude = ca.Function("attitude", [given["last"], eps], [received(eps, given["last"])])
+    errors = ca.Function("errors", [q, omega, q_d, omega_d], tracking_errors(q, omega, q_d, omega_d))
+    with as_written():
+        q = attitude(given["last"], eps)
+        e, omega_e = errors(q, omega, q_d, omega_d)
+        return ca.Function(
+            "law",
+            [*given.values(), u, after],
+            [q, u, after, e[0], e[1:4], omega_e],
+            [*given, "law_voltages", "law_state"],
+            ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
+            {"cse": True},
+        )
+
+
 def check_voltages(law: Law[Any], voltages: int) -> None:
     """Raise ValueError if a law gives another number of voltages than there are actuators."""
     if voltages != law.actuators:
