@@ -27,7 +27,7 @@ from aeroloop.protocol.wire.attitude import Quaternion, angle, distance
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.daemon.telemetry import telemetry_of
+from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
