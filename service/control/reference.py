@@ -25,7 +25,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.rotations import conjugate, from_euler, product
-from aeroloop.protocol.wire.symbolic import Compiled, in_columns
+from aeroloop.protocol.wire.symbolic import Compiled
 
 Floats = NDArray[np.float64]
 
@@ -339,9 +339,9 @@ def desired(reference: Reference, period: float, ticks: int) -> Floats:
     plan = Plan.of(reference)
     t = np.arange(ticks) * period
     piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
-    function = Compiled(in_columns(reference_function(), ticks))
-    given = {"t": t, "start": plan.starts[piece], "quintic": plan.quintic[piece].reshape(ticks, -1)}
-    for name, rows in {**given, "amplitude": plan.amplitude[piece], "frequency": plan.frequency[piece]}.items():
-        np.asarray(function.inputs[name]).reshape(-1, ticks)[:] = rows.T
+    rows = t, plan.starts[piece], plan.quintic[piece], plan.amplitude[piece], plan.frequency[piece]
+    function = Compiled(reference_function().map(ticks))
+    for memory, row in zip(function.inputs.values(), rows, strict=True):
+        np.asarray(memory)[:] = row.ravel()
     function()
-    return np.concatenate([np.asarray(memory).reshape(-1, ticks) for memory in function.outputs.values()]).T
+    return np.concatenate([np.asarray(memory).reshape(ticks, -1) for memory in function.outputs.values()], axis=1)

@@ -34,10 +34,10 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, distance, to_euler
-from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
+from aeroloop.service.control.motion import Approach, nearest_turn
 from aeroloop.service.control.reference import FollowError, Limits, Plan
 from aeroloop.service.settings import ControllerSettings
 

@@ -17,16 +17,16 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Hold, Reference, Sinusoid, Stream
-from aeroloop.service.control.approach import (
+from aeroloop.service.control.motion import (
     LEAST_TURN_S,
     Approach,
+    Motion,
     approached,
     nearest_turn,
     rounded_up,
     shortest,
     to_set_point,
 )
-from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
 from tests.service.control.test_motion import (
     BENCH,

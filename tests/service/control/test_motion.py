@@ -26,8 +26,7 @@ from aeroloop.protocol.messages.operator import (
     Stream,
 )
 from aeroloop.protocol.wire.symbolic import buffer
-from aeroloop.service.control.approach import Approach, approached
-from aeroloop.service.control.motion import Motion
+from aeroloop.service.control.motion import Approach, Motion, approached
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
 from tests.support.numpy_twin import Array, Sinusoids
 
