@@ -78,8 +78,9 @@ class Stage:
     def rows(self) -> list[tuple[int, int]]:
         """Tick and Sent of each row in the published trace."""
         key = topics.key("trace", "aero", role="controller")
-        batches = [read_batch(payload).columns for at, payload in self.network.put if at == key]
-        return [row for batch in batches for row in zip(batch["tick"].tolist(), batch["sent_as"].tolist(), strict=True)]
+        batches = filter(None, (read_batch(payload) for at, payload in self.network.put if at == key))
+        columns = [(batch.columns["tick"].tolist(), batch.columns["sent_as"].tolist()) for batch in batches]
+        return [row for tick, sent_as in columns for row in zip(tick, sent_as, strict=True)]
 
     def status_of_plant(self, session: str, cause: str | None = None) -> None:
         """A status of the plant is received."""
@@ -156,12 +157,13 @@ def test_a_law_that_fails_or_takes_too_long_faults_the_controller_by_name(
     assert [any(map(isnan, volts)) for volts in stage.commands] == [False] * valid + [True] * invalid
 
 
-def test_nothing_is_sent_after_an_operator_has_released_the_vehicle_or_the_process_is_stopped() -> None:
-    for end in (
-        lambda stage: stage.shared.machine.fire(ControllerTrigger.STAND_DOWN),
-        lambda stage: stage.role.stop.set(),
-    ):
-        stage = Stage(map(arrival, range(10)))
-        stage.role.enqueue(lambda stage=stage, end=end: end(stage))
-        assert not stage.run()
-        assert stage.commands == []
+@pytest.mark.parametrize(
+    "end",
+    [lambda stage: stage.shared.machine.fire(ControllerTrigger.STAND_DOWN), lambda stage: stage.role.stop.set()],
+    ids=["released by an operator", "stopped"],
+)
+def test_nothing_is_sent_from_the_tick_on_at_which_it_is_ended(end: Callable[[Stage], object]) -> None:
+    stage = Stage(map(arrival, range(10)))
+    stage.role.enqueue(lambda: end(stage))
+    assert not stage.run()
+    assert stage.commands == []
