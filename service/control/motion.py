@@ -224,12 +224,10 @@ def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan
         here = Angles(*(np.array([row]) for row in begin))
     there = target.first
     if brake is None or run_up is None:
-        states, lengths = [here], []
-        if within_s:
-            states.append(there)
-            lengths.append(within_s)
-        knots = Angles(*(np.concatenate(parts) for parts in zip(*states, strict=True)))
-        return target.after(np.cumsum([t, *lengths]), np.array(lengths), knots)
+        if not within_s:
+            return target.after(np.array([t]), np.array([]), here)
+        knots = Angles(*map(np.concatenate, zip(here, there, strict=True)))
+        return target.after(np.array([t, t + within_s]), np.array([within_s]), knots)
     brake_s, run_up_s = np.array(brake), np.array(run_up)
     s = np.unique(np.concatenate([[0.0, within_s], brake_s, within_s - run_up_s]))
     before = braked(here, brake_s, s)

@@ -150,12 +150,10 @@ class Plan:
             lengths: Their differences, before they were rounded by an addition [s]. Shape (n − 1,).
             knots: States, the last of them this plan's first. Shapes (n, 3).
         """
-        later = replace(self, starts=self.starts + starts[-1])
         here, there = Angles(*(part[:-1] for part in knots)), Angles(*(part[1:] for part in knots))
-        return self._polynomial(starts[:-1], join(here, there, lengths))._then(later)
-
-    def _then(self, later: Plan) -> Plan:
-        return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
+        way = self._polynomial(starts[:-1], join(here, there, lengths))
+        later = replace(self, starts=self.starts + starts[-1])
+        return Plan(*(np.concatenate([getattr(plan, name) for plan in (way, later)]) for name in self.__annotations__))
 
     def piece(self, t: float) -> int:
         """Index of the piece that contains time t [s]."""

@@ -95,7 +95,7 @@ class OperatorChanges:
         self._controller: Controller | None = None
         self._k = 0
         self._started_near = True
-        self._followed: Reference = reference  # what the motion follows: of a stream, its last set-point
+        self._present_reference: Reference = reference  # what the motion follows: of a stream, its last set-point
         self._last: SessionRecord | None = None  # this controller's own last session
         self.record = SessionRecord(
             controller=role.name,
@@ -175,10 +175,10 @@ class OperatorChanges:
         if self._settings.after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self.record.gains)
-        controller.motion.follow(Plan.of(self._followed), 0.0)
+        controller.motion.follow(Plan.of(self._present_reference), 0.0)
         self._started_near = False
         self.setpoints.discard()
-        self._record_change(gains=self.record.gains, reference=self._followed)
+        self._record_change(gains=self.record.gains, reference=self._present_reference)
 
     def end(self) -> None:
         """End the session."""
@@ -206,11 +206,11 @@ class OperatorChanges:
             return
         self._begin_with(reference, "resumed", last.within_s)
         if isinstance(reference, Stream):
-            self._followed = Hold()  # until the first set-point
+            self._present_reference = Hold()  # until the first set-point
 
     def _begin_with(self, reference: Reference, source: Source, within_s: float = 0.0) -> None:
         """Begin the next session with a reference; a hold without attitude holds the attitude found."""
-        self._followed = reference
+        self._present_reference = reference
         self._update_record(reference=reference, reference_from=source, **Approach(within_s)._asdict())
 
     def _start_near(self, frame: bytes) -> None:
@@ -224,7 +224,7 @@ class OperatorChanges:
         if attitude is None:
             return
         self._started_near = True
-        start, t, target = hold_here(attitude, rolls=self._rolls), self._time, self._followed
+        start, t, target = hold_here(attitude, rolls=self._rolls), self._time, self._present_reference
         if self.record.reference_from != "configured" and target == Hold():
             target, approach = Hold(attitude=start), Approach(start=start)
             plan = Plan.of(target)
@@ -273,7 +273,7 @@ class OperatorChanges:
 
     def _follow(self, reference: Reference, plan: Plan, approach: Approach) -> None:
         self._running().motion.follow(plan, self._time, approach)
-        self._followed = reference
+        self._present_reference = reference
         self._record_change(reference=reference, **approach._asdict())
 
     def _check(self, reference: Reference) -> Plan:
