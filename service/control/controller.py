@@ -146,11 +146,7 @@ class ControllerSnapshot(BaseModel):
 class Controller:
     """The law between a measurement frame and a command frame.
 
-    Args:
-        wire: Format of the frames.
-        law: Which law, its parameters and gains.
-        reference: Reference from tick 0 on.
-        period: Time between ticks [s].
+    It follows the reference from tick 0 on; `period` is the time between ticks [s].
 
     Attributes:
         tick_index: k of the last measurement answered; −1 before the first.

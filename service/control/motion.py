@@ -211,11 +211,8 @@ def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) ->
 def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan:
     """A plan that reaches the target by an approach.
 
-    Args:
-        target: What to follow in the end; its own time begins then.
-        here: The state at its start, unless the approach has one, as `start` or `here`. Shapes (1, 3).
-        t: Time of its start [s].
-        approach: Its times.
+    The target's own time begins when it is reached. The approach begins at time t [s] from the state `here`, of shapes
+    (1, 3), unless it has one of its own, as `start` or `here`.
     """
     within_s, start, brake, run_up, begin = approach
     if start is not None:
@@ -241,15 +238,12 @@ def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan
 
 
 class Motion:
-    """The reference as the loop evaluates it, tick by tick.
+    """The reference as the loop evaluates it, tick by tick, and `plan`, which is followed now.
 
     Args:
         reference: What to follow from t = 0 on.
         shared: Memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
             function with the same inputs, which then evaluates the reference at the time last set.
-
-    Attributes:
-        plan: The plan followed now.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:

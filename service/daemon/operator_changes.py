@@ -53,9 +53,7 @@ class OperatorChanges:
     """Gains and reference of one controller, and their changes.
 
     Args:
-        role: Its presence on the network.
-        law: The initial gains.
-        reference: The initial reference.
+        law, reference: As configured.
         settings: Limits of references, and what a session begins with.
         trace: Where changes are recorded.
         rolls: Whether the vehicle can roll.

@@ -55,16 +55,9 @@ class Shared:
     """What one session leaves to the next: everything of the process but controller and link.
 
     Attributes:
-        claims: Claim protocol with the plant.
-        machine: State of the process.
         cause: Why the last session ended.
-        trace: Rows of ticks that are not yet published.
-        changes: Gains, reference and an operator's changes of them.
-        plant: The plant's status.
-        watch: Watch of a law's ticks.
         timing: Timing of the loop; None in lockstep.
         age: From a measurement received to its command sent.
-        counts: Counted since the start of the process.
     """
 
     def __init__(self, role: Node, settings: Settings, why_none: Callable[[], str]) -> None:
@@ -103,16 +96,7 @@ class Counts:
 
 
 class Session:
-    """The session that `Shared.claims` has just been granted.
-
-    Args:
-        role: Presence on the network.
-        settings: The configuration.
-        shared: What stays from session to session.
-        controller: A new controller.
-        link: Carries the frames.
-        publish_status: Publishes the status when it is due.
-    """
+    """The session that `Shared.claims` has just been granted; `publish_status` publishes the status when it is due."""
 
     def __init__(
         self,

@@ -123,12 +123,7 @@ def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
 
 
 def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
-    """The law that a section configures.
-
-    Args:
-        section: `[law]`.
-        period: Time between ticks [s].
-        actuators: Number of voltages to give.
+    """The law that a section configures, for ticks of a period [s].
 
     Raises:
         PluginError: There is no such law.
