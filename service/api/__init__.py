@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from aeroloop.research import run_experiment as run_experiment
     from aeroloop.service.config import Settings as Settings
     from aeroloop.service.control.controller import Controller as Controller
-    from aeroloop.service.control.laws.body import gravity_torque as gravity_torque
-    from aeroloop.service.control.laws.body import voltages_for as voltages_for
     from aeroloop.service.control.laws.interface import ExpressionLaw as ExpressionLaw
     from aeroloop.service.control.laws.interface import Gain as Gain
     from aeroloop.service.control.laws.interface import Gains3 as Gains3
@@ -44,6 +42,8 @@ if TYPE_CHECKING:
     from aeroloop.service.control.laws.interface import Now as Now
     from aeroloop.service.control.laws.interface import PositiveGain as PositiveGain
     from aeroloop.service.control.laws.interface import PythonLaw as PythonLaw
+    from aeroloop.service.control.laws.interface import gravity_torque as gravity_torque
+    from aeroloop.service.control.laws.interface import voltages_for as voltages_for
     from aeroloop.service.figures import Figures as Figures
     from aeroloop.service.logs.ticks import Ticks as Ticks
     from aeroloop.service.testing.hil import Hil as Hil
@@ -74,11 +74,11 @@ _HOMES: Final = {
     "UniformQuantizer": "aeroloop.protocol.wire.quantizer",
     "WireSpec": "aeroloop.protocol.wire.spec",
     "certify": "aeroloop.research",
-    "gravity_torque": "aeroloop.service.control.laws.body",
+    "gravity_torque": "aeroloop.service.control.laws.interface",
     "load_settings": "aeroloop.research",
     "read_run": "aeroloop.research",
     "run_experiment": "aeroloop.research",
-    "voltages_for": "aeroloop.service.control.laws.body",
+    "voltages_for": "aeroloop.service.control.laws.interface",
 }
 """Module of each public name. Names load on first use: `import aeroloop` stays light, and so does every command."""
 

@@ -161,7 +161,7 @@ def _run_plant(options: DaemonOptions, *overrides: str) -> None:
     settings = settings_of(options.config, options.overrides, *overrides)
 
     def run(role: Node) -> None:
-        from aeroloop.service.daemon.plants import run_plant
+        from aeroloop.service.daemon.roles import run_plant
 
         run_plant(role, settings)
 
@@ -186,7 +186,7 @@ def router(
             typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)
         return
 
-    from aeroloop.service.daemon.router import run_router
+    from aeroloop.service.daemon.roles import run_router
 
     run_role("router", settings, run_router, options)
 

@@ -4,30 +4,118 @@ It uses no socket, no clock and no log, so the daemon, the lockstep experiment, 
 run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
 sent; the controller then receives UNCHANGED and computes with the levels it holds.
 
-Between the two frames stands one evaluation of a `Tick`, on memory that stays. Its outputs are one row of doubles;
-after a valid tick the row is copied, and the copy is what the next tick and the properties here read.
+Between the codes of the one frame and those of the other stands one CasADi function, `tick_function`. Its outputs are
+one row of doubles. After a valid tick the row is copied; the copy is what the next tick continues from.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from math import isnan, nan
+from typing import Any, Final
 
+import casadi as ca
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion
+from aeroloop.protocol.wire.expressions import as_written, encode, level, saturates
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.symbolic import Buffer, integers, parts
+from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, parts
 from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
-from aeroloop.service.control.laws.evaluation import configured_gains
-from aeroloop.service.control.laws.interface import LawSettings
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.evaluation import (
+    check_voltages,
+    configured_gains,
+    initial_state,
+    law_function,
+)
+from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
+from aeroloop.service.control.laws.registry import LawError, law_of, words_of
 from aeroloop.service.control.motion import Motion
-from aeroloop.service.control.tick import Tick
+from aeroloop.service.control.reference import reference_function
 
 Codes = tuple[float, ...]
+
+OF_MEASUREMENT: Final = ("q", "state_next", "q_d", "omega", "eps_e", "omega_e")
+"""Outputs that are kept of every measurement with valid values; the others only if u is a number."""
+
+# ── one tick as one function ──
+
+
+def tick_function(wire: WireSpec, law: Law[Any]) -> ca.Function:
+    """One tick: codes of a measurement in, codes of the command out.
+
+    The parts are inserted as they are written, so every bit is that of the parts evaluated one after the other.
+
+    Inputs:
+        codes: Of the measurement. Shape (6,).
+        t, start, quintic, amplitude, frequency: Time, and the reference's piece, as for `reference_function`.
+        gains: The law's gains, one below the other.
+        last, state: q and the law's state after the last measurement.
+        held: Codes of the last valid command; NaN before the first. Shape (actuators,).
+        saturated: Voltages beyond the range so far.
+        law_voltages, law_state: Of a law in Python only: what it has computed in this tick.
+
+    Outputs:
+        q, state_next: State for the next tick.
+        q_d, omega, eps_e, omega_e: Desired attitude, rate as received, errors.
+        u: Command before quantization [V]. Shape (actuators,).
+        command: Its codes. Shape (actuators,).
+        saturated_next: The count for the next tick.
+        measured: 1 if each code of the measurement has a level. If 0, no output above counts.
+        computed: 1 if u is a number, too. If 0, u, command and saturated_next do not count.
+        eta_e, omega_d, omega_d_dot: The rest of what a law in Python computes from.
+
+    Raises:
+        ValueError: The law does not fit so many actuators.
+    """
+    laws = law_function(law)
+    reference = reference_function()
+    piece = {name: ca.SX.sym(name, *reference.size_in(name)) for name in reference.name_in()}
+    computed_here = ("eps", "omega", "q_d", "omega_d", "omega_d_dot")
+    of_law = {name: ca.SX.sym(name, laws.size1_in(name)) for name in laws.name_in() if name not in computed_here}
+    codes, held, saturated = ca.SX.sym("codes", 6), ca.SX.sym("held", wire.actuators), ca.SX.sym("saturated")
+    signals = [wire.attitude.quantizer()] * 3 + [wire.rate.quantizer()] * 3
+    voltage = wire.voltage.quantizer()
+    with as_written():
+        levels = ca.vertcat(*map(level, signals, ca.vertsplit(codes)))
+        desired = reference.call(piece)
+        found = laws.call(of_law | desired | {"eps": levels[:3], "omega": levels[3:]})
+        u = ca.vertsplit(found["u"])
+        measured = _is_number(ca.sum1(levels))
+        outputs = {
+            "q": found["q"],
+            "state_next": found["state_next"],
+            "q_d": desired["q_d"],
+            "omega": levels[3:],
+            "eps_e": found["eps_e"],
+            "omega_e": found["omega_e"],
+            "u": found["u"],
+            "command": ca.vertcat(*(encode(voltage, u[i], held[i]) for i in range(wire.actuators))),
+            "saturated_next": saturated + sum(saturates(voltage, volts) for volts in u),
+            "measured": measured,
+            "computed": ca.logic_and(measured, _is_number(ca.sum1(found["u"]))),
+            "eta_e": found["eta_e"],
+            "omega_d": desired["omega_d"],
+            "omega_d_dot": desired["omega_d_dot"],
+        }
+        inputs = {"codes": codes} | piece | of_law | {"held": held, "saturated": saturated}
+        return ca.Function("tick", [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True})
+
+
+def _is_number(x: ca.SX) -> ca.SX:
+    return ca.fabs(x) <= ca.inf
+
+
+@lru_cache(maxsize=16)  # 20 ms; of a session's end and the next one's begin, and of many runs with the same law
+def _expressions_function(wire: WireSpec, law: type[ExpressionLaw[Any]], settings: str, period: float) -> ca.Function:
+    return tick_function(wire, law(law.Settings.model_validate_json(settings), period, wire.actuators))
+
+
+# ── the controller ──
 
 
 class ControllerSnapshot(BaseModel):
@@ -57,11 +145,7 @@ class ControllerSnapshot(BaseModel):
 class Controller:
     """The law between a measurement frame and a command frame.
 
-    Args:
-        wire: Format of the frames.
-        law: Which law, its parameters and gains.
-        reference: Reference from tick 0 on.
-        period: Time between ticks [s].
+    It follows the reference from tick 0 on; `period` is the time between ticks [s].
 
     Attributes:
         tick_index: k of the last measurement answered; −1 before the first.
@@ -70,8 +154,8 @@ class Controller:
         refused: Malformed measurement frames so far.
         fault: Why the law gave no voltages, once it has not; None before.
         invalid: Measurements with the code "no valid value" so far.
-        outputs: What the last tick computed, by name as of `controller_function`; `row` has it one beside the other.
-        last: The same of the last valid tick.
+        outputs: What the last tick computed, by name as of `tick_function`; `row` has them one beside the other.
+        last_valid: The same of the last valid tick.
 
     Raises:
         LawError: The law cannot be used, such as one for another number of actuators.
@@ -87,28 +171,41 @@ class Controller:
         self.invalid = 0
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)
-        self._tick = tick = Tick(wire, self.law, period)
-        self.row, self._kept, self.outputs, self.last = tick.row, tick.kept_row, tick.found, tick.kept
-        self._evaluate, self._codes = tick.evaluate, tick.inputs["codes"]
-        self._measured, self._computed = tick.found["measured"], tick.found["computed"]
-        self._command: memoryview[int] | Buffer
-        self._command = tick.found["command"] if wire.voltage.bits is None else integers(tick.found["words"])
+        try:
+            gains, state = configured_gains(self.law), initial_state(self.law)
+            if isinstance(self.law, ExpressionLaw):
+                settings = self.law.settings.model_dump_json()
+                function = _expressions_function(wire, type(self.law), settings, period)
+            else:
+                function = tick_function(wire, self.law)
+        except Exception as error:
+            raise LawError(words_of(law.kind, error)) from None
+
+        sizes = {name: function.numel_out(name) for name in function.name_out()}
+        self.row, self._last_row = buffer(sum(sizes.values())), buffer(sum(sizes.values()))
+        self.outputs, self.last_valid = parts(self.row, sizes), parts(self._last_row, sizes)
+        last = self.last_valid
+        carried = {"last": last["q"], "state": last["state_next"], "held": last["command"]}
+        memory = self.outputs | carried | {"saturated": last["saturated_next"]}
+        self._function = Compiled(function, memory)
+        self._evaluate, self._codes = self._function.evaluate, self._function.inputs["codes"]
+        self._measured, self._computed = self.outputs["measured"], self.outputs["computed"]
+        self._gains = parts(self._function.inputs["gains"], {name: len(gain) for name, gain in gains.items()})
+        self._state = parts(last["state_next"], {name: len(values) for name, values in state.items()})
+        self._runs_python = isinstance(self.law, PythonLaw)
+        self._without_law = False
+        self.motion = Motion(reference, self._function.inputs)
+
+        self._as_codes: Callable[[float], float] = float if wire.voltage.bits is None else int
         self._no_command = [wire.voltage.quantizer().invalid] * wire.actuators
-        self._regardless = tick.regardless
-        self.motion = Motion(reference, shared=tick.inputs)
-        self._gains = parts(tick.inputs["gains"], tick.gains)
-        self._law_state = parts(tick.kept["state_next"], tick.states)
-        self.set_gains(Gains.model_validate(configured_gains(self.law)))
         self._counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
-        self._periodic = wire.transmit.command == "periodic"
         self._sender = Sender(wire.transmit.command, heartbeat, self._counters)
         self._silence_allowed = wire.transmit.measurement == "on_change"
         self._held: Sequence[float] | None  # codes of the last measurement
-        self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
         self._read, self._write = wire.measurement.unpack, wire.command.pack
-        initial: Buffer = memoryview(bytearray(array("d", tick.initial))).cast("d")
-        self.restore(ControllerSnapshot(law={name: tuple(part) for name, part in parts(initial, tick.states).items()}))
+        self.set_gains(Gains.model_validate(gains))
+        self.restore(ControllerSnapshot(law={name: tuple(values) for name, values in state.items()}))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Answer a measurement.
@@ -119,8 +216,8 @@ class Controller:
             k: Tick index; the law's time is k·period.
 
         Returns:
-            The command frame; UNCHANGED if it would repeat the last one; None if there is nothing to answer, which
-            includes malformed bytes. A measurement without a valid value is answered by a command without
+            The command frame; UNCHANGED if it would repeat the last one; None if there is nothing to
+            answer, which includes malformed bytes. A measurement without a valid value is answered by a command without
             one: the plant then goes to 0 V.
         """
         if frame is None:
@@ -137,23 +234,55 @@ class Controller:
         codes[0], codes[1], codes[2], codes[3], codes[4], codes[5] = self._held  # the quickest way for so few
         self.motion.set(k * self.period)
         self._evaluate()
-        if self._computed[0]:
-            self._kept[:] = self.row
+        if self._runs_python:
+            self._step_python()
+            self._evaluate()
+        if self._measured[0]:
             self.tick_index, self.counter = k, counter
-            command: Sequence[float] = self._command.tolist()
+        command: Sequence[float] = self._no_command
+        if self._computed[0]:
+            self._last_row[:] = self.row
+            command = [*map(self._as_codes, self.outputs["command"])]
+        elif self._measured[0]:
+            self.fault = self.fault or f"law {self.law.settings.kind} gave no number"
+            for name in OF_MEASUREMENT:
+                self.last_valid[name][:] = self.outputs[name]
         else:
-            self._take_no_value(counter, k)
-            command = self._no_command
-        return self._write(counter, command) if self._periodic or self._sender.due(k, command) else UNCHANGED
-
-    def _take_no_value(self, counter: int, k: int) -> None:
-        """Count a measurement without a valid value, or keep what the law gives besides a voltage that is no number."""
-        if not self._measured[0]:
             self.invalid += 1
+        return self._write(counter, command) if self._sender.due(k, command) else UNCHANGED
+
+    def _step_python(self) -> None:
+        """Compute voltages and next state of a law in Python, from what the function has found so far."""
+        law, seen, inputs = self.law, self.outputs, self._function.inputs
+        assert isinstance(law, PythonLaw)
+        _write_to(inputs["law_voltages"], [nan] * self.wire.actuators)
+        inputs["law_state"][:] = self.last_valid["state_next"]
+        if self._without_law or not self._measured[0]:
             return
-        self.fault = self._tick.fault or f"law {self.law.settings.kind} gave no number"
-        self._kept[: self._regardless] = self.row[: self._regardless]
-        self.tick_index, self.counter = k, counter
+        # Copies: the law may keep or change them.
+        law.state = {name: np.array(values) for name, values in self._state.items()}
+        now = Now(
+            attitude=np.array(seen["q"]),
+            rate=np.array(seen["omega"]),
+            desired_attitude=np.array(seen["q_d"]),
+            desired_rate=np.array(seen["omega_d"]),
+            desired_acceleration=np.array(seen["omega_d_dot"]),
+            attitude_error=np.concatenate([seen["eta_e"], seen["eps_e"]]),
+            rate_error=np.array(seen["omega_e"]),
+            gains={name: np.array(gain) for name, gain in self._gains.items()},
+            state=law.state,
+        )
+        try:
+            u = np.asarray(law.step(now), dtype=np.float64).ravel()
+            check_voltages(law, u.size)
+            after = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in law.state.items()}
+            if {name: values.size for name, values in after.items()} != {n: len(v) for n, v in self._state.items()}:
+                raise ValueError(f"its state after a tick is not that of `reset`: {', '.join(self._state) or 'none'}")
+        except Exception as error:  # a user's code may raise anything
+            self.fault = words_of(law.settings.kind, error)
+            return
+        _write_to(inputs["law_voltages"], u)
+        _write_to(inputs["law_state"], (value for name in self._state for value in after[name]))
 
     def hold(self, frame: bytes) -> bool:
         """Hold the levels of a measurement that was received after its tick was over. False if it is malformed."""
@@ -164,31 +293,25 @@ class Controller:
         self._held = read[1]
         return True
 
-    def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
-        """A tick by codes: the voltages before quantization [V]; None if there is no valid value.
-
-        Shapes (6,) and (actuators,).
-        """
-        self.tick(self.wire.measurement.pack(counter, codes), k)
-        return self.voltages if self._computed[0] else None
-
     def attitude_of(self, frame: bytes) -> Quaternion | None:
         """The attitude in a measurement; None if it is malformed or has no valid value."""
         read = self._read(frame)
         codes = read[1] if read is not None else self._held if frame == UNCHANGED and self._silence_allowed else None
         if codes is None:
             return None
-        x, y, z = map(self._attitude_level, codes[:3])
-        return received_quaternion(x, y, z, IDENTITY) if x + y + z == x + y + z else None
+        x, y, z = map(self.wire.attitude.quantizer().level, codes[:3])
+        return None if isnan(x + y + z) else received_quaternion(x, y, z, IDENTITY)
+
+    def leave_out_law(self) -> None:
+        """Compute only attitude, desired attitude and errors from now on, where the law is in Python."""
+        self._without_law = True
+
+    # ── gains, reference and state ──
 
     def set_gains(self, gains: Gains) -> None:
         """Use other gains from the next tick on; None leaves a gain unchanged."""
         for name, gain in gains.named.items():
-            self._gains[name][:] = memoryview(array("d", gain))
-
-    def leave_out_law(self) -> None:
-        """Compute only attitude, desired attitude and errors from now on, where the law is in Python."""
-        self._tick.without_law = True
+            _write_to(self._gains[name], gain)
 
     def apply(self, change: Change) -> None:
         """Apply a recorded change; the next tick must be its first, or later."""
@@ -200,7 +323,7 @@ class Controller:
     def state(self) -> ControllerSnapshot:
         """State for the next tick, besides reference and gains."""
         sent_codes, sent_tick = self._sender.memory
-        held, codes = self._held, tuple(self.last["command"])
+        held, codes = self._held, tuple(self.last_valid["command"])
         return ControllerSnapshot(
             attitude=self.attitude,
             law=self.law_state,
@@ -212,13 +335,11 @@ class Controller:
 
     def restore(self, state: ControllerSnapshot) -> None:
         """Continue bit for bit from this state, given the same reference and gains."""
-        codes = state.voltage_codes or [nan] * self.wire.actuators
-        rows = {"q": state.attitude, "command": codes}
-        for name, values in rows.items():
-            self.last[name][:] = memoryview(array("d", values))
-        for name, part in self._law_state.items():
+        _write_to(self.last_valid["q"], state.attitude)
+        _write_to(self.last_valid["command"], state.voltage_codes or [nan] * self.wire.actuators)
+        for name, part in self._state.items():
             if len(values := state.law.get(name, ())) == len(part):  # that of another law does not count
-                part[:] = memoryview(array("d", values))
+                _write_to(part, values)
         widths = self.wire.measurement.widths
         self._held = state.held and [
             code if width is None else int(code) for code, width in zip(state.held, widths, strict=True)
@@ -233,39 +354,43 @@ class Controller:
     @property
     def law_state(self) -> dict[str, tuple[float, ...]]:
         """The law's named state after the last measurement."""
-        return {name: tuple(part) for name, part in self._law_state.items()}
+        return {name: tuple(part) for name, part in self._state.items()}
 
     @property
     def attitude(self) -> Quaternion:
         """q^Q of the last measurement [1]."""
-        return tuple(self.last["q"])  # type: ignore[return-value]  # four elements
+        return tuple(self.last_valid["q"])  # type: ignore[return-value]  # four elements
 
     @property
     def rate(self) -> Vector:
         """ω^Q of the last measurement, body frame [rad/s]."""
-        return tuple(self.last["omega"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last_valid["omega"])  # type: ignore[return-value]  # three elements
 
     @property
-    def attitude_error(self) -> tuple[float, float, float]:
+    def attitude_error(self) -> Vector:
         """ε̃ at the last measurement [1]."""
-        return tuple(self.last["eps_e"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last_valid["eps_e"])  # type: ignore[return-value]  # three elements
 
     @property
-    def rate_error(self) -> tuple[float, float, float]:
+    def rate_error(self) -> Vector:
         """ω_e at the last measurement, body frame [rad/s]."""
-        return tuple(self.last["omega_e"])  # type: ignore[return-value]  # three elements
+        return tuple(self.last_valid["omega_e"])  # type: ignore[return-value]  # three elements
 
     @property
     def desired(self) -> Quaternion:
         """q_d at the last measurement [1]."""
-        return tuple(self.last["q_d"])  # type: ignore[return-value]  # four elements
+        return tuple(self.last_valid["q_d"])  # type: ignore[return-value]  # four elements
 
     @property
     def voltages(self) -> list[float]:
         """The last u before quantization [V]. Shape (actuators,)."""
-        return list(self.last["u"])
+        return list(self.last_valid["u"])
 
     @property
     def saturated(self) -> int:
         """Commanded voltages beyond the quantizer's range so far."""
-        return int(self.last["saturated_next"][0])
+        return int(self.last_valid["saturated_next"][0])
+
+
+def _write_to(memory: Buffer, values: Iterable[float]) -> None:
+    memory[:] = memoryview(array("d", values))

@@ -1,42 +1,249 @@
-"""Motion: the reference as the loop evaluates it tick by tick, and its changes.
+"""Motion: the reference as the loop follows it tick by tick, and the approach from one reference to another.
 
-However often the reference changes, its angle, rate and acceleration never jump.
+However often the reference changes, its angle, rate and acceleration never jump. In an approach each axis brakes to
+rest, then all of them turn along a straight line of roll, pitch and yaw, from rest to rest, and each runs up to the
+rate of the reference that is reached; the run-up is a braking seen backwards. So no axis goes further beyond its start
+or its target than it takes to stop there. The time given changes the speed of the turn and nothing else: more time
+never makes an approach less possible, and the shortest time is known without a search.
+
+A set-point of a stream is reached by a single quintic, which need not stop, where that swings out no further.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from math import ceil, degrees, floor, inf, isfinite, log10
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from aeroloop.protocol.messages.operator import Change, Hold, Reference
+from aeroloop.protocol.messages.operator import MAX_WITHIN_S, Change, Hold, Reference
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled
-from aeroloop.service.control.approach import (
-    Approach,
-    approached,
-    at_rest,
-    braked,
-    braking_times,
-    shortest,
-    to_set_point,
+from aeroloop.service.control.reference import (
+    SAMPLES,
+    Angles,
+    Floats,
+    FollowError,
+    Limits,
+    Plan,
+    reference_function,
 )
-from aeroloop.service.control.reference import Angles, Limits, Plan, reference_function
+
+LEAST_TURN_S: Final = 0.02
+"""Least time of the turn [s], however small it is."""
+LET_GO_S: Final = 0.1
+"""Least time in which an acceleration is reduced to 0 [s]: 50 ticks at 500 Hz, where a jump would be a step of torque;
+from rest it moves an axis by a 1200th of the acceleration meanwhile, which is 0.05° for each rad/s²."""
+_HARDER: Final = 6
+"""How often the time of a braking is halved at the most, where it would otherwise leave the limits."""
+_SLOWER: Final = 1.05
+_TRIES: Final = 8
+_SLACK: Final = 1 + 1e-9
+"""Rounding of what is compared with a limit."""
+
+
+class Approach(NamedTuple):
+    """Times of an approach, as in the trace's changes. The default is a jump.
+
+    Attributes:
+        within_s: All of it [s].
+        start: Roll, pitch, yaw to begin from, at rest, instead of the present reference [deg].
+        brake_s: Time in which roll, pitch, yaw each brake to rest at its start; None for a single quintic [s].
+        run_up_s: Time in which each runs up to the rate of the target at its end [s].
+        here: Roll, pitch, yaw to begin from [rad], their rates [rad/s] and accelerations [rad/s²]; None with `start`.
+    """
+
+    within_s: float = 0.0
+    start: Vector | None = None
+    brake_s: Vector | None = None
+    run_up_s: Vector | None = None
+    here: tuple[Vector, Vector, Vector] | None = None
+
+    def at_least(self, within_s: float) -> Approach:
+        """This shortest approach, extended to `within_s` if that is longer."""
+        return self._replace(within_s=max(within_s, self.within_s))
+
+    def lasting(self, within_s: float, limits: Limits) -> Approach:
+        """This shortest approach, extended to `within_s`.
+
+        Raises:
+            FollowError: That is too short; with the shortest time that would do.
+        """
+        if within_s * _SLACK >= self.within_s:
+            return self.at_least(within_s)
+        parts = {
+            "braking alone": max(self.brake_s or (0.0,)),
+            "running up to the reference": max(self.run_up_s or (0.0,)),
+        }
+        turn_s = within_s - sum(parts.values())
+        if turn_s < LEAST_TURN_S:
+            why = " and ".join(f"{part} takes {seconds:g} s" for part, seconds in parts.items() if seconds)
+        else:
+            rate = (self.within_s - sum(parts.values())) / turn_s * limits.rate
+            why = (
+                f"in {within_s:g} s it would turn at {rounded_up(rate):g} rad/s, more than "
+                f"controller.max_reference_rate = {limits.rate:g} rad/s"
+            )
+        enough = self.within_s <= MAX_WITHIN_S
+        remedy = f"--in {rounded_up(self.within_s):g} would do" if enough else f"even {MAX_WITHIN_S:g} s would be"
+        raise FollowError(f"the approach is too short: {why}; {remedy}")
+
 
 JUMP: Final = Approach()
 
 
+def rounded_up(value: float) -> float:
+    """Three significant digits of a positive number that are not less."""
+    if not isfinite(value):
+        return value
+    digits = 2 - floor(log10(value))
+    return round(ceil(round(value * 10.0**digits, 6)) * 10.0**-digits, max(0, digits))
+
+
+def at_rest(angle: Floats) -> Angles:
+    """The state of a body at rest [rad]. Shape (…, 3)."""
+    return Angles(angle, np.zeros_like(angle), np.zeros_like(angle))
+
+
+def nearest_turn(attitude: Vector, target: Plan) -> Vector:
+    """The same attitude, each angle within half a turn of the first of the target [deg]: −10° is 350°."""
+    first = np.degrees(target.first.angle[0])
+    roll, pitch, yaw = (a + 360.0 * round((f - a) / 360.0) for a, f in zip(attitude, first.tolist(), strict=True))
+    return roll, pitch, yaw
+
+
+def braked(state: Angles, brake_s: Floats, s: Floats) -> Angles:
+    """States on the way to rest: the rate is a cubic of time that ends at 0 without an acceleration.
+
+    Args:
+        state: Where it begins. Shapes (1, 3).
+        brake_s: Time that each axis takes [s]; 0 for one that is at rest. Shape (3,).
+        s: Times since it began [s]. Shape (n,).
+    """
+    angle, rate, acceleration = state
+    T = np.where(brake_s > 0, brake_s, 1.0)
+    u = np.clip(s[:, None] / T, 0.0, 1.0)
+    left = 1 - u
+    return Angles(
+        angle + rate * T * u * (1 - u * u * (1 - u / 2)) + acceleration * T * T * u * u * (6 - 8 * u + 3 * u * u) / 12,
+        (rate * (1 + 2 * u) + acceleration * T * u) * left * left,
+        (acceleration * (1 - 3 * u) - 6 * rate / T * u) * left,
+    )
+
+
+def braking_times(state: Angles, limits: Limits) -> Floats:
+    """Time in which each axis brakes to rest [s], whole milliseconds. Shape (3,).
+
+    The acceleration stays within `limits.braking`, or the present one where that is larger. Where rate or tilt would
+    exceed their limits meanwhile, because the body still gathers speed or is near the limit, it brakes harder.
+    """
+    rate, acceleration = np.abs(state.rate[0]), np.abs(state.acceleration[0])
+    # `braked` accelerates by at most 3/2 rate / T + acceleration / 3, or by what it begins with.
+    times: Floats = 1.5 * rate / (np.maximum(limits.braking, acceleration) - acceleration / 3)
+    times = np.ceil(1000 * np.where(acceleration > 0, np.maximum(times, LET_GO_S), times)) / 1000
+    for _ in range(_HARDER):
+        way = braked(state, times, np.linspace(0.0, float(times.max()), SAMPLES))
+        speeds, tilts = way.speeds(), way.tilts()
+        if speeds.max() <= max(limits.rate, speeds[0]) * _SLACK and tilts.max() <= max(limits.tilt, tilts[0]) * _SLACK:
+            break
+        times = np.ceil(500 * times) / 1000
+    return times
+
+
+def stopping_distances(state: Angles, brake_s: Floats) -> Floats:
+    """How far each axis turns, at most, while it brakes [rad]. Shape (3,)."""
+    distances: Floats = np.abs(state.rate[0]) * brake_s / 2 + np.abs(state.acceleration[0]) * brake_s**2 / 12
+    return distances
+
+
+def _backwards(state: Angles) -> Angles:
+    return Angles(state.angle, -state.rate, state.acceleration)
+
+
+def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
+    """The shortest approach to a target within the limits. Raises FollowError if there is none."""
+    there = _backwards(target.first)
+    brake_s, run_up_s = braking_times(here, limits), braking_times(there, limits)
+    still_s = float(brake_s.max()) + float(run_up_s.max())
+    begin, end = (
+        braked(state, times, np.array([times.max()])).angle for state, times in ((here, brake_s), (there, run_up_s))
+    )
+    u = np.linspace(0.0, 1.0, SAMPLES)[:, None]  # the turn, within 1 s
+    way = begin + (end - begin) * u**3 * (10 - 15 * u + 6 * u * u)
+    turn = Angles(way, (end - begin) * 30 * (u * (1 - u)) ** 2, np.zeros_like(way))
+    within_s = still_s + max(LEAST_TURN_S, float(turn.speeds().max()) / limits.rate)
+    if not isfinite(within_s):
+        raise FollowError("that is too far, or too fast, for any approach")
+    tilts = turn.tilts()
+    if tilts.max() > max(limits.tilt, tilts[0], tilts[-1]) * _SLACK:
+        raise FollowError(
+            f"the approach tilts by {degrees(float(tilts.max())):.1f}°, more than controller.max_reference_tilt_deg = "
+            f"{degrees(limits.tilt):g}°, however long it takes: go there in smaller steps"
+        )
+    if not still_s:
+        return Approach(within_s)  # from rest to rest it is a single quintic
+    return Approach(within_s, brake_s=tuple(brake_s.tolist()), run_up_s=tuple(run_up_s.tolist()))
+
+
+def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) -> Approach:
+    """The approach to a set-point within the limits: a single quintic in `within_s` or somewhat more, or the shortest.
+
+    A quintic is taken if it goes no further beyond its start or its target than braking does, within the limits or
+    within `within_s`. Raises FollowError if there is no approach.
+    """
+    brake_s = np.maximum(braking_times(here, limits), within_s)
+    ends = np.concatenate([here.angle, target.first.angle])
+    margin = stopping_distances(here, brake_s) + 1e-9  # rounding of what is hardly moving
+    low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
+    candidate = within_s
+    for _ in range(_TRIES):
+        way = approached(target, here, 0.0, Approach(candidate)).samples()
+        if not (np.all((low <= way.angle) & (way.angle <= high)) and way.tilts().max() <= limits.tilt):
+            break  # a slower one would swing further
+        fastest = float(way.speeds().max())
+        if fastest <= limits.rate:
+            return Approach(candidate)
+        candidate *= _SLOWER * fastest / limits.rate
+    return shortest(target, here, limits).at_least(within_s)
+
+
+def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan:
+    """A plan that reaches the target by an approach.
+
+    The target's own time begins when it is reached. The approach begins at time t [s] from the state `here`, of shapes
+    (1, 3), unless it has one of its own, as `start` or `here`.
+    """
+    within_s, start, brake, run_up, begin = approach
+    if start is not None:
+        here = at_rest(np.radians(np.array([start])))
+    elif begin is not None:
+        here = Angles(*(np.array([row]) for row in begin))
+    there = target.first
+    if brake is None or run_up is None:
+        if not within_s:
+            return target.after(np.array([t]), np.array([]), here)
+        knots = Angles(*map(np.concatenate, zip(here, there, strict=True)))
+        return target.after(np.array([t, t + within_s]), np.array([within_s]), knots)
+    brake_s, run_up_s = np.array(brake), np.array(run_up)
+    s = np.unique(np.concatenate([[0.0, within_s], brake_s, within_s - run_up_s]))
+    before = braked(here, brake_s, s)
+    after = _backwards(braked(_backwards(there), run_up_s, within_s - s))
+    braking = (s <= brake_s.max())[:, None]
+    knots = Angles(*(np.where(braking, b, a) for b, a in zip(before, after, strict=True)))
+    return target.after(t + s, np.diff(s), knots)
+
+
+# ── the reference as followed ──
+
+
 class Motion:
-    """The reference as the loop evaluates it, tick by tick.
+    """The reference as the loop evaluates it, tick by tick, and `plan`, which is followed now.
 
     Args:
         reference: What to follow from t = 0 on.
         shared: Memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
             function with the same inputs, which then evaluates the reference at the time last set.
-
-    Attributes:
-        plan: The plan followed now.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
@@ -51,10 +258,12 @@ class Motion:
             self._load(self.plan.piece(t))
         self._time[0] = t
 
-    def at(self, t: float) -> None:
-        """Write the desired motion at time t [s] to the outputs."""
+    def at(self, t: float) -> tuple[list[float], list[float], list[float]]:
+        """q_d [1], ω_d [rad/s] and ω̇_d [rad/s²] at time t [s], as `reference_function` has them."""
         self.set(t)
         self._function()
+        q_d, omega_d, omega_d_dot = map(list, self._function.outputs.values())
+        return q_d, omega_d, omega_d_dot
 
     def follow(self, target: Plan, t: float, approach: Approach = JUMP) -> None:
         """Follow another plan from time t [s] on, by an approach; its own time begins when it is reached."""
@@ -69,8 +278,7 @@ class Motion:
 
     def attitude(self, t: float) -> Quaternion:
         """q_d at time t [s]."""
-        self.at(t)
-        w, x, y, z = self._function.outputs["q_d"]
+        w, x, y, z = self.at(t)[0]
         return w, x, y, z
 
     def rest(self, t: float, limits: Limits) -> Hold:
@@ -101,7 +309,7 @@ class Motion:
 
     def _load(self, i: int) -> None:
         plan, inputs = self.plan, self._function.inputs
-        self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else float("inf")
+        self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else inf
         inputs["start"][0] = plan.starts[i]
         inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # CasADi is column-major
         inputs["amplitude"][:] = memoryview(plan.amplitude[i].copy())

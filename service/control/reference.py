@@ -149,12 +149,10 @@ class Plan:
             lengths: Their differences, before they were rounded by an addition [s]. Shape (n − 1,).
             knots: States, the last of them this plan's first. Shapes (n, 3).
         """
-        later = replace(self, starts=self.starts + starts[-1])
         here, there = Angles(*(part[:-1] for part in knots)), Angles(*(part[1:] for part in knots))
-        return self._polynomial(starts[:-1], join(here, there, lengths))._then(later)
-
-    def _then(self, later: Plan) -> Plan:
-        return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
+        way = self._polynomial(starts[:-1], join(here, there, lengths))
+        later = replace(self, starts=self.starts + starts[-1])
+        return Plan(*(np.concatenate([getattr(plan, name) for plan in (way, later)]) for name in self.__annotations__))
 
     def piece(self, t: float) -> int:
         """Index of the piece that contains time t [s]."""
@@ -338,9 +336,9 @@ def desired(reference: Reference, period: float, ticks: int) -> Floats:
     plan = Plan.of(reference)
     t = np.arange(ticks) * period
     piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
+    rows = t, plan.starts[piece], plan.quintic[piece], plan.amplitude[piece], plan.frequency[piece]
     function = Compiled(reference_function().map(ticks))
-    pieces = {"start": plan.starts, "quintic": plan.quintic, "amplitude": plan.amplitude, "frequency": plan.frequency}
-    for name, rows in {"t": t, **{name: values[piece] for name, values in pieces.items()}}.items():
-        np.asarray(function.inputs[name])[:] = rows.ravel()  # CasADi is column-major: one tick after the other
+    for memory, row in zip(function.inputs.values(), rows, strict=True):
+        np.asarray(memory)[:] = row.ravel()
     function()
-    return np.hstack([np.asarray(memory).reshape(ticks, -1) for memory in function.outputs.values()])
+    return np.concatenate([np.asarray(memory).reshape(ticks, -1) for memory in function.outputs.values()], axis=1)

@@ -102,17 +102,15 @@ class ClaimClient:
         """Release the session, whether or not the plant still answers."""
         if self.session is None:
             return
-        release = Release(session=self.session)
-        key = topics.key("release", self._role.vehicle)
+        role, session, self.session = self._role, self.session, None
         try:
-            for _ in self._role.zenoh.get(key, payload=release.encode(), timeout=ANSWER_WAIT_S):
+            for _ in role.zenoh.get(
+                topics.key("release", role.vehicle), payload=Release(session=session).encode(), timeout=ANSWER_WAIT_S
+            ):
                 pass
-        except zenoh.ZError as error:
-            lost = Event(
-                role=self._role.role, kind="fault", text=f"could not release the session: {error}", session=self.session
-            )
-            log_event(lost, self._role.vehicle)  # not published: Zenoh has just failed
-        self.session = None
+        except zenoh.ZError as error:  # an event that is not published: Zenoh has just failed
+            text = f"could not release the session: {error}"
+            log_event(Event(role=role.role, kind="fault", text=text, session=session), role.vehicle)
 
     def _carrier(self) -> zenoh.Session | None:
         """The session of the frames: of datagrams once it has a link to the plant. None while that is undecided."""
@@ -142,10 +140,9 @@ class ClaimClient:
         for reply in self._role.zenoh.get(key, payload=claim.encode(), timeout=ANSWER_WAIT_S):
             if reply.ok is None:
                 continue
-            payload = reply.ok.payload.to_bytes()
             for model in _ANSWERS:
                 with suppress(MessageError):
-                    read = model.decode(payload)
+                    read = model.decode(reply.ok.payload.to_bytes())
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 

@@ -58,16 +58,8 @@ class TickSource:
 
     The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
 
-    Args:
-        link: Receives the frames.
-        loop: The grid.
-        wire: Format of the frames, and whether every tick has one.
-        own_grid: Whether to tick on a grid of its own.
-        stale_s: A frame that arrives later than this is not answered [s].
-        clock: Of the link's arrivals.
-
-    Attributes:
-        tick: The last; −1 before the first.
+    `tick` is the last, −1 before the first. A frame that arrives later than `stale_s` [s] is not answered. `clock` is
+    that of the link's arrivals.
     """
 
     def __init__(

@@ -225,7 +225,7 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     """
     logged, hypothetical = LoggedController(session), LoggedController(session)
     hypothetical.controller.leave_out_law()
-    outputs, last = logged.controller.outputs, logged.controller.last
+    outputs, last = logged.controller.outputs, logged.controller.last_valid
     names = list(outputs)[: list(outputs).index("u") + 1]
     widths = [len(last["state_next"]), *(len(outputs[name]) for name in names)]
     ends = np.cumsum(widths).tolist()
@@ -250,7 +250,7 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
             if followed != logged.controller.tick_index:
                 followed = logged.controller.tick_index
                 for name in ("q", "state_next"):
-                    beside.last[name][:] = last[name]
+                    beside.last_valid[name][:] = last[name]
             hypothetical.change(tick)
             beside.tick(plant["measurement"][row].tobytes(), tick)
             if beside.outputs["measured"][0]:

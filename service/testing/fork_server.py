@@ -38,7 +38,7 @@ _PRELOADED: Final = (
     "aeroloop.service.cli.run",
     "aeroloop.service.terminal.encoding",
     "aeroloop.service.daemon.daemon",
-    "aeroloop.service.daemon.plants",
+    "aeroloop.service.daemon.roles",
     "aeroloop.service.recording.recorder",
     "aeroloop.service.viewers.channels",
     "aeroloop.plant_emulator.hosts.can_node",

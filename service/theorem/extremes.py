@@ -16,7 +16,7 @@ import numpy as np
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Stream
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.body import check_invertible
+from aeroloop.service.control.laws.interface import check_invertible
 from aeroloop.service.control.reference import Angles, Floats, Plan, turning
 from aeroloop.service.theorem.bounds import attitude_error
 from aeroloop.service.theorem.configured import Sections, with_theorem

@@ -24,7 +24,7 @@ from aeroloop.protocol.transport.history import Delivery as Message
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.daemon.telemetry import telemetry_of
+from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording.log_file import LogFile

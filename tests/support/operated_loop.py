@@ -26,9 +26,7 @@ from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.daemon import operator_requests
-from aeroloop.service.daemon.operator_changes import OperatorChanges
-from aeroloop.service.daemon.setpoint_stream import SETPOINTS
+from aeroloop.service.daemon.operator_changes import SETPOINTS, OperatorChanges
 from aeroloop.service.settings import ControllerSettings
 from tests.support.clock import FakeClock
 
@@ -143,7 +141,7 @@ class Loop:
             rolls=rolls,
             why_none=lambda: "controller-7 does not have aero",
         )
-        operator_requests.serve(self.role, self.live)
+        self.live.serve()
         self.controller = self.fresh()
         self.k, self.session = 0, ""
         self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}

@@ -32,8 +32,16 @@ import casadi as ca
 from pydantic import AfterValidator, Field, model_validator
 
 from aeroloop.protocol.wire.attitude import R, S
-from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
-from aeroloop.service.control.laws.interface import MAX_GAIN, ExpressionLaw, LawSettings, Now, Vector
+from aeroloop.service.control.laws.interface import (
+    MAX_GAIN,
+    ExpressionLaw,
+    LawSettings,
+    Now,
+    Vector,
+    check_allocation,
+    gravity_torque,
+    voltages_for,
+)
 
 ESTIMATE_REACH: Final = 1 / 0.95
 """‖θ̂‖ may reach this times k_θ: Remark 5's inequality needs every θ of Assumption 2 in the projection's inner ball."""

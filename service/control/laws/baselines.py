@@ -37,8 +37,18 @@ from pydantic import Field, NonNegativeFloat
 
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
-from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
-from aeroloop.service.control.laws.interface import Diagonal, ExpressionLaw, Floats, Gains3, LawSettings, Now, Vector
+from aeroloop.service.control.laws.interface import (
+    Diagonal,
+    ExpressionLaw,
+    Floats,
+    Gains3,
+    LawSettings,
+    Now,
+    Vector,
+    check_allocation,
+    gravity_torque,
+    voltages_for,
+)
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, VOLTAGE_LIMIT, tuned
 
 _PD, _PID, _SLIDING, _LQR = (tuned(kind, PAPER_BODY, PAPER) for kind in ("pd", "pid", "sliding", "lqr"))

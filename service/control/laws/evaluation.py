@@ -34,53 +34,60 @@ def tracking_errors(q: ca.SX, omega: ca.SX, q_d: ca.SX, omega_d: ca.SX) -> tuple
     return ca.vertcat(eta_e, eps_e), omega - R(q).T @ omega_d
 
 
-def law_function(law: ExpressionLaw[Any]) -> ca.Function:
-    """One tick of a law of expressions.
+INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
+
+
+def law_function(law: Law[Any]) -> ca.Function:
+    """One tick of a law.
 
     Inputs: last (the previous q), state, gains, and eps, omega, q_d, omega_d, omega_d_dot. The named states stand one
-    below the other, as do the gains.
+    below the other, as do the gains. Of a law in Python also law_voltages and law_state, which it has computed.
     Outputs: q, u, state_next, eta_e, eps_e, omega_e.
 
     Raises:
         ValueError: The law gives another number of voltages, or another state than its first one.
     """
-    states = {name: len(value) for name, value in law.initial().items()}
-    gain_sizes = {name: len(value) for name, value in configured_gains(law).items()}
-    sizes = dict(zip(INPUTS, (4, sum(states.values()), sum(gain_sizes.values()), 3, 3, 4, 3, 3), strict=True))
-    last, state, gains, eps, omega, q_d, omega_d, omega_d_dot = (ca.SX.sym(name, n) for name, n in sizes.items())
+    states = {name: len(value) for name, value in initial_state(law).items()}
+    gains = {name: len(value) for name, value in configured_gains(law).items()}
+    sizes = dict(zip(INPUTS, (4, sum(states.values()), sum(gains.values()), 3, 3, 4, 3, 3), strict=True))
+    last, state, gain, eps, omega, q_d, omega_d, omega_d_dot = (ca.SX.sym(name, n) for name, n in sizes.items())
     q, e, omega_e = ca.SX.sym("q", 4), ca.SX.sym("e", 4), ca.SX.sym("omega_e", 3)
-    now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, split(gains, gain_sizes), split(state, states))
-    voltages, after = law.expressions(now)
-    u = ca.densify(ca.vec(ca.SX(voltages)))
-    check_voltages(law, u.numel())
-    found = {name: ca.vec(ca.SX(value)) for name, value in after.items()}
-    if {name: value.numel() for name, value in found.items()} != states:
-        raise ValueError(f"its state after a tick is not that of `initial`: {', '.join(states) or 'none'}")
-    state_after = ca.densify(ca.vertcat(ca.SX(0, 1), *(found[name] for name in states)))
-    seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gains]
-    of_attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
-    of_errors = ca.Function(
+    attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
+    errors = ca.Function(
         "errors", [q, omega, q_d, omega_d], list(tracking_errors(q, omega, q_d, omega_d)), {"cse": True}
     )
-    of_state = ca.Function("state", seen, [state_after], {"cse": True})
-    of_voltages = ca.Function("voltages", seen, [u], {"cse": True})
+    seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
     given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
-    last, state, gains, eps, *motion = given.values()
+    if isinstance(law, ExpressionLaw):
+        now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, split(gain, gains), split(state, states))
+        answer = ca.Function("answer", seen, _expressions(law, now, states), {"cse": True})
+    else:
+        of_law = ca.SX.sym("law_voltages", law.actuators), ca.SX.sym("law_state", sizes["state"])
+        given |= dict(zip(("law_voltages", "law_state"), of_law, strict=True))
+    last, state, gain, eps, *motion = list(given.values())[: len(INPUTS)]
     with as_written():
-        q = of_attitude(last, eps)
-        e, omega_e = of_errors(q, *motion[:3])
-        inputs = state, q, *motion, e, omega_e, gains
+        q = attitude(last, eps)
+        e, omega_e = errors(q, *motion[:3])
+        u, after = answer(state, q, *motion, e, omega_e, gain) if isinstance(law, ExpressionLaw) else of_law
         return ca.Function(
             "law",
             [*given.values()],
-            [q, of_voltages(*inputs), of_state(*inputs), e[0], e[1:4], omega_e],
+            [q, u, after, e[0], e[1:4], omega_e],
             [*given],
             ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
             {"cse": True},  # the parts overlap, and a law may compute the errors once more, as the paper has them
         )
 
 
-INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
+def _expressions(law: ExpressionLaw[Any], now: Now[ca.SX], states: Mapping[str, int]) -> list[ca.SX]:
+    """Voltages and next state of a law, each in one column; `states` are the sizes of its first state."""
+    voltages, after = law.expressions(now)
+    u = ca.densify(ca.vec(ca.SX(voltages)))
+    check_voltages(law, u.numel())
+    found = {name: ca.vec(ca.SX(value)) for name, value in after.items()}
+    if {name: value.numel() for name, value in found.items()} != states:
+        raise ValueError(f"its state after a tick is not that of `initial`: {', '.join(states) or 'none'}")
+    return [u, ca.densify(ca.vertcat(ca.SX(0, 1), *(found[name] for name in states)))]
 
 
 def check_voltages(law: Law[Any], voltages: int) -> None:

@@ -1,4 +1,4 @@
-"""Law interface: settings, and one tick, as CasADi expressions or as Python.
+"""Law interface: settings, with the body that a law knows, and one tick, as CasADi expressions or as Python.
 
 Each tick the controller gives a law the attitude and rate as received, the desired motion and the errors between them,
 and takes voltages. What a law carries from tick to tick is its named state: it is in snapshots, telemetry and logs, so
@@ -12,21 +12,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
+from aeroloop.protocol.wire.attitude import R, S
 
-    Floats = npt.NDArray[np.float64]
-else:
-    Floats = Any  # what only reads settings does not wait for NumPy
+Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 X = TypeVar("X")
-S = TypeVar("S", bound="LawSettings")
+T = TypeVar("T", bound="LawSettings")
 
 MAX_GAIN: Final = 20.0
 """The largest gain: no typing error makes one a hundred times too large."""
@@ -98,7 +96,7 @@ class Now(NamedTuple, Generic[X]):
     state: Mapping[str, X]
 
 
-class Law(ABC, Generic[S]):
+class Law(ABC, Generic[T]):
     """A control law. Derive from `ExpressionLaw` or `PythonLaw`.
 
     Args:
@@ -119,7 +117,7 @@ class Law(ABC, Generic[S]):
     gains: ClassVar[tuple[str, ...]] = ()
     units: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(self, settings: S, period: float, actuators: int) -> None:
+    def __init__(self, settings: T, period: float, actuators: int) -> None:
         self.settings = settings
         self.period = period
         self.actuators = actuators
@@ -134,7 +132,7 @@ class Law(ABC, Generic[S]):
         return None
 
 
-class ExpressionLaw(Law[S]):
+class ExpressionLaw(Law[T]):
     """A law of CasADi expressions."""
 
     def initial(self) -> Mapping[str, Sequence[float]]:
@@ -146,7 +144,7 @@ class ExpressionLaw(Law[S]):
         """The voltages before quantization [V], shape (actuators,), and the named state after this tick."""
 
 
-class PythonLaw(Law[S]):
+class PythonLaw(Law[T]):
     """A law in plain Python. `step` runs once a tick, between a received frame and the sent one: it must not block.
 
     Attributes:
@@ -163,3 +161,51 @@ class PythonLaw(Law[S]):
     @abstractmethod
     def step(self, now: Now[Floats]) -> Sequence[float] | Floats:
         """The voltages before quantization [V], shape (actuators,). Sets `state` to what it is after this tick."""
+
+
+# ── the body of a law's settings ──
+
+
+def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
+    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""
+    weight = ca.vertcat(0, 0, -p.mass * p.gravity)
+    return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
+
+
+def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
+    """The voltages whose torque B u is this, the least ones if there are several [V]. Shape (actuators,).
+
+    A B of three columns serves two motors, too: they are its last two, and the first row is fictitious.
+
+    Args:
+        p: Has B.
+        torque: Body frame, an expression or an array [N·m]. Shape (3,).
+        actuators: Number of motors.
+
+    Raises:
+        ValueError: B has no inverse, or another number of columns.
+    """
+    B: Floats = check_allocation(p, actuators)
+    if isinstance(torque, np.ndarray):
+        return (np.linalg.pinv(B) @ torque)[-actuators:]
+    if B.shape == (3, 3):
+        return ca.solve(ca.SX(B), torque)[3 - actuators :]
+    return ca.mtimes(ca.SX(np.linalg.pinv(B)), torque)
+
+
+def check_allocation(p: LawSettings, actuators: int) -> Floats:
+    """B, if it fits so many motors and has an inverse; else ValueError with the key. Shape (3, columns)."""
+    columns = {len(row) for row in p.allocation}
+    fits = actuators in columns or (columns == {3} and actuators == 2)
+    if len(columns) > 1 or not fits:
+        found = "/".join(map(str, sorted(columns)))
+        raise ValueError(f"law.allocation (B) has {found} columns for {actuators} actuators: one for each motor")
+    B: Floats = np.array(p.allocation)
+    check_invertible(B)
+    return B
+
+
+def check_invertible(B: Floats) -> None:
+    """Raise ValueError, with the key, if B or a part of it has no inverse. Shape (n, m), n ≤ m."""
+    if B.shape[0] > B.shape[1] or np.linalg.cond(B) > 1e12:
+        raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, create_model
+from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, create_model
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Gains
@@ -124,12 +123,7 @@ def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
 
 
 def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
-    """The law that a section configures.
-
-    Args:
-        section: `[law]`.
-        period: Time between ticks [s].
-        actuators: Number of voltages to give.
+    """The law that a section configures, for ticks of a period [s].
 
     Raises:
         PluginError: There is no such law.
@@ -160,14 +154,8 @@ def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettin
 
 
 def _valid(model: type[LawSettings], values: dict[str, Any]) -> LawSettings:
-    configuration = _configuration(model)
+    configuration: Any = create_model("Configuration", law=(model, ...))  # so that messages have the whole key
     try:
-        return configuration.model_validate({"law": values}).law  # type: ignore[attr-defined, no-any-return]  # its field
+        return configuration.model_validate({"law": values}).law  # type: ignore[no-any-return]  # of `model`
     except ValidationError as error:
         raise LawError("; ".join(problems(error, configuration))) from None
-
-
-@lru_cache(maxsize=32)  # gains are checked between two ticks, too, and making a model takes a quarter of one
-def _configuration(model: type[LawSettings]) -> type[BaseModel]:
-    """A model around a law's, so that messages have the whole key."""
-    return create_model("Configuration", law=(model, ...))

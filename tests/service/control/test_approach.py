@@ -16,17 +16,15 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.operator import Hold, Reference, Sinusoid, Stream
-from aeroloop.service.control.approach import (
+from aeroloop.protocol.messages.operator import Hold, Reference, Sinusoid
+from aeroloop.service.control.motion import (
     LEAST_TURN_S,
     Approach,
+    Motion,
     approached,
-    nearest_turn,
-    rounded_up,
     shortest,
     to_set_point,
 )
-from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
 from tests.service.control.test_motion import (
     BENCH,
@@ -37,7 +35,6 @@ from tests.service.control.test_motion import (
     here,
     holds,
     piece_states,
-    quaternion,
     rounding,
     seconds,
     some_points,
@@ -145,18 +142,6 @@ def test_no_axis_goes_further_beyond_its_start_or_its_target_than_it_takes_to_st
     assert np.all(angles <= high)
 
 
-def test_an_even_turn_stops_within_three_quarters_of_its_rate_squared_by_the_limit() -> None:
-    turning = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, 0.5, 0.0)))
-    target = Plan.of(Hold())
-    angles, rates, accelerations = way(
-        approached(target, turning, 0.0, shortest(target, turning, BODY._replace(braking=0.25))), target, 10.0
-    )
-    assert angles.max() == pytest.approx(0.75 * 0.5**2 / 0.25, rel=1e-9)
-    braking = slice(0, int(np.argmax(angles[:, 2])))
-    assert np.all(np.diff(rates[braking, 2]) <= 0)  # it only ever slows down
-    assert accelerations[braking, 2].min() == pytest.approx(-0.25, rel=1e-4)
-
-
 @settings(max_examples=40)
 @given(start=any_states(), reference=tracked, braking=st.sampled_from([0.1, 1.0, 5.0]))
 def test_braking_and_run_up_stay_within_the_limit_of_acceleration_or_the_one_that_they_find(
@@ -225,20 +210,6 @@ def test_neither_angle_nor_rate_nor_acceleration_jumps(
         tolerance = rounding(around, t + approach.within_s, float(np.diff(plan.starts[: count + 1]).min())) + 1e-300
         for order in range(3):
             assert np.abs(before[order] - after[order]).max() <= tolerance[order]
-
-
-@settings(max_examples=40)
-@given(start=any_states(), target=holds, longer_s=seconds(0, 5))
-def test_what_is_gone_to_is_reached_in_the_time_given_and_held(start: Angles, target: Hold, longer_s: float) -> None:
-    assert target.attitude is not None
-    goal = Plan.of(target)
-    approach = shortest(goal, start, NO_LIMITS._replace(rate=1.0))
-    plan = approached(goal, start, 3.0, approach.at_least(approach.within_s + longer_s))
-    for later in (0.0, 1.0, 1e4):
-        angle, rate, acceleration = states(plan, 3.0 + approach.within_s + longer_s + 1e-9 + later)
-        assert angle == pytest.approx(np.radians(target.attitude), abs=1e-12)
-        assert not np.any(rate)
-        assert not np.any(acceleration)
 
 
 # How long it takes
@@ -315,12 +286,6 @@ def test_a_way_that_tilts_further_than_both_its_ends_is_refused_as_no_time_would
         Motion(Hold()).shortest(Plan.of(target), 0.0, limits, start)
 
 
-@given(value=st.floats(1e-6, 1e6))
-def test_a_time_is_rounded_up_to_three_digits(value: float) -> None:
-    assert value * (1 - 1e-6) <= rounded_up(value) <= value * 1.0101
-    assert len(f"{rounded_up(value):g}".replace(".", "").lstrip("0").split("e")[0]) <= 3 or value >= 1000
-
-
 # Rest
 
 
@@ -342,17 +307,6 @@ def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Re
 
 
 # From the attitude of a body
-
-
-@given(attitude=triples(60), target=triples(1000))
-def test_a_body_is_approached_from_the_nearest_turn(
-    attitude: tuple[float, float, float], target: tuple[float, float, float]
-) -> None:
-    """A body at yaw −10° is 50° away from yaw 40°, and as far from yaw 400°."""
-    found = nearest_turn(attitude, Plan.of(Hold(attitude=target)))
-    assert np.all(np.abs(np.array(found) - target) <= 180 + 1e-9)
-    same = abs(quaternion(np.radians(found)) @ quaternion(np.radians(attitude)))
-    assert same == pytest.approx(1.0, abs=1e-12)
 
 
 # Set-points of a stream
@@ -389,23 +343,3 @@ def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hol
     ends = np.concatenate([start.angle, plan.first.angle])
     assert np.all(ends.min(axis=0) - margin <= angles)
     assert np.all(angles <= ends.max(axis=0) + margin)
-
-
-def test_planning_changes_nothing() -> None:
-    followed, left_alone = Followed(Sinusoid()), Followed(Sinusoid())
-    target = Plan.of(Hold(attitude=(0.0, 0.0, 170.0)))
-    followed.motion.to_set_point(target, 1.0, 0.2, BENCH)
-    followed.motion.shortest(target, 1.0, BENCH)
-    followed.motion.rest(1.0, BENCH)
-    for got, expected in zip(followed.at(1.5), left_alone.at(1.5), strict=True):
-        assert np.array_equal(got, expected)
-
-
-def test_a_far_set_point_in_the_middle_of_a_quick_one_is_reached_within_the_limit() -> None:
-    followed = Followed(Stream())
-    near, far = (Hold(attitude=(0.0, 0.0, yaw)) for yaw in (1.0, 170.0))
-    followed.approach(near, 0.0, followed.motion.to_set_point(Plan.of(near), 0.0, 0.2, BENCH))
-    approach = followed.motion.to_set_point(Plan.of(far), 0.04, 0.2, BENCH)
-    followed.approach(far, 0.04, approach)
-    assert followed.plan.fastest() <= BENCH.rate
-    assert approach.within_s < 60.0

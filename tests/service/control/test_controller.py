@@ -6,7 +6,7 @@ twin.
 
 from __future__ import annotations
 
-from math import cos, isnan, nan, pi, radians, sin
+from math import cos, isnan, pi, radians, sin
 
 import numpy as np
 import pytest
@@ -141,24 +141,6 @@ def test_a_measurement_without_a_valid_value_is_answered_by_a_command_without_on
     assert controller.tick(good, 5) == untouched.tick(good, 5)  # θ̂ and the sign know nothing of it
 
 
-def test_three_actuators_get_three_voltages() -> None:
-    wire = WireSpec(actuators=3).with_bits(None, None)
-    controller, two = _controller(wire), _controller(CONTINUOUS)
-    attitude, rate = (0.98, 0.05, 0.02, (1 - 0.98**2 - 0.05**2 - 0.02**2) ** 0.5), (0.01, 0.02, 0.03)
-    _, voltages = _answer(wire, controller.tick(_frame(wire, 0, attitude, rate), 0))
-    _, last_two = _answer(CONTINUOUS, two.tick(_frame(CONTINUOUS, 0, attitude, rate), 0))
-    u1 = twin.law(
-        body_of(LAW), np.array(attitude), np.array(rate), *_desired_at_start(), np.array(LAW.damping_estimate), 1.0
-    ).u[0]
-    assert voltages[1:] == last_two
-    # rounding of some hundred operations; the row of u₁ is the fictitious identity
-    assert voltages[0] == pytest.approx(u1, rel=1e-12)
-
-
-def _desired_at_start() -> tuple[Array, Array, Array]:
-    return twin.Sinusoids(np.radians(PAPER.amplitude), np.array(PAPER.frequency)).desired(0.0)
-
-
 def test_voltages_beyond_the_range_are_sent_as_its_edge_and_counted() -> None:
     turned = _yawed(radians(60))  # B needs u₂ = −u₃·0.79 or so for a torque of 0.5 N·m: hundreds of volts
     controller = _controller(CONTINUOUS, LEVEL)
@@ -176,25 +158,6 @@ def test_a_law_without_inverse_is_refused() -> None:
     law = AdaptiveSettings(allocation=((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 1.0)))
     with pytest.raises(LawError, match="no inverse"):
         _controller(law=law)
-
-
-# What it reports of itself
-
-
-def test_what_it_reports_is_what_the_law_computed() -> None:
-    controller, loop = _controller(), TwinLoop(PAPER)
-    attitude, rate = _yawed(0.2), (0.02, -0.03, 0.05)
-    controller.tick(_frame(CONTINUOUS, 3, attitude, rate), 250)
-    u = loop.tick(np.array(attitude), np.array(rate), 250)
-    desired = loop.reference.desired(250 * PERIOD)
-    state = twin.law(loop.body, np.array(attitude), np.array(rate), *desired, np.array(LAW.damping_estimate), 1.0)
-    # all by some hundred operations of 2e-16; the voltages have B's condition of 900 on top
-    assert controller.attitude_error == pytest.approx(state.e[1:], abs=1e-14)
-    assert controller.rate_error == pytest.approx(state.omega_e, abs=1e-14)
-    assert controller.desired == pytest.approx(desired[0], abs=1e-14)
-    assert controller.law_state["damping_estimate"] == pytest.approx(loop.theta, abs=1e-14)
-    assert controller.voltages == pytest.approx(u, rel=1e-12)
-    assert (_sign(controller), controller.tick_index, controller.counter) == (1, 250, 3)
 
 
 # The sign of z₁, Assumption 3
@@ -216,49 +179,6 @@ def test_the_sign_is_that_of_the_first_error_and_stays() -> None:
     # the desired yaw is 6 ticks past its crest: 170° (1 − cos 2°) = 0.12°, so ε̃ = sin 0.06°
     assert far.attitude_error == pytest.approx((0.0, 0.0, sin(radians(85 * (1 - cos(0.012 * pi))))), abs=1e-12)
     assert _sign(far) == -1
-
-
-def test_a_measurement_without_a_valid_value_does_not_choose_the_sign() -> None:
-    controller = _controller(reference=AHEAD)
-    controller.tick(CONTINUOUS.measurement.pack(0, [nan] * 6), 250)
-    assert _sign(controller) == 0
-    controller.tick(_frame(CONTINUOUS, 1, _yawed(radians(-170)), AT_REST), 250)
-    assert _sign(controller) == -1
-
-
-def test_from_a_large_attitude_the_body_turns_the_short_way() -> None:
-    """Yaw −170° to a desired 170°: with z₁₋ it turns by −20°, through the back, and not by +340°."""
-    held = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
-    aero = IDEAL_AERO
-    plant = twin.LockedBody(
-        body_of(LAW),
-        np.vstack([np.zeros(2), aero.thrust]),
-        np.array(aero.damping),
-        np.array([0.0, radians(-170), 0, 0]),
-    )
-    controller = _controller(reference=held)
-    yaws = []
-    for k in range(14_000, 16_000):  # 28 s to 32 s
-        _, u = _answer(CONTINUOUS, controller.tick(_frame(CONTINUOUS, k, _q(plant), _w(plant)), k))
-        plant.advance(np.array(u), PERIOD, 1)
-        yaws.append(np.degrees(plant.x[1]))
-    assert _sign(controller) == -1
-    assert max(yaws) < -170  # never the long way, from the first tick on
-    assert yaws[-1] > -200  # −190° is 170°
-    # Around rest this is a mass of 0.0218 kg·m² on a spring of ½ N·m/rad, nearly critically damped by C₂: 4 s are 16
-    # time constants. What stays is damping that the law does not know, 0.0125 N·m·s/rad, at up to 0.02 rad/s and on a
-    # gain of 1; twice that for the acceleration of the reference.
-    assert max(abs(error) for error in controller.attitude_error) < 0.0125 * 0.02 * 2
-
-
-def _q(plant: twin.LockedBody) -> Quaternion:
-    w, x, y, z = (float(value) for value in plant.q)
-    return w, x, y, z
-
-
-def _w(plant: twin.LockedBody) -> Vector:
-    x, y, z = (float(value) for value in plant.omega)
-    return x, y, z
 
 
 # The sign of q through full turns, Remarks 1 and 2

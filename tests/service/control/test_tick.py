@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from math import isnan
 from random import Random
 
@@ -147,25 +146,3 @@ def test_a_tick_has_the_bits_of_its_parts_one_after_the_other(wire: WireSpec, re
         if random.random() < 0.1:
             controller.restore(ControllerSnapshot.model_validate_json(controller.state.model_dump_json()))
         k += random.choice([1, 1, 1, 40])
-
-
-def test_no_tick_allocates_memory_that_stays() -> None:
-    """Not of valid measurements, nor of those without a value, malformed ones and late ones, over 20 000 ticks."""
-    wire = WireSpec.model_validate({"transmit": "on_change"})
-    controller = Controller(wire, AdaptiveSettings(), Sinusoid(), PERIOD)
-    given = frames(wire, Random(0), 500)
-
-    def run(start: int) -> int:
-        for k in range(start, start + 10_000):
-            controller.tick(given[k % 500], k)
-            if k % 50 == 0:
-                controller.hold(given[k % 499])
-        return tracemalloc.get_traced_memory()[0]
-
-    run(0)  # integers beyond 256 are objects, and dictionaries of attributes settle
-    tracemalloc.start()
-    try:
-        before, after = run(10_000), run(20_000)
-    finally:
-        tracemalloc.stop()
-    assert after - before < 100  # a float or two that took another's place; a word a tick would be 80 kB

@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.operator import (
 )
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, distance, received_quaternion
-from aeroloop.service.daemon.session_start import remaining
+from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
 from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, Loop, turned
 
@@ -235,7 +235,7 @@ def test_points_go_on_with_the_first_that_was_not_reached(
     points = Points(times=times, attitudes=[(0.0, 0.0, float(i)) for i in range(len(times))])
     times_of_it = {"since_tick": since, "ended_tick": since + followed, "within_s": float(within)}
     last = record(points).model_copy(update=times_of_it)
-    left = remaining(last, PERIOD)
+    left = rest_of_reference(last, PERIOD)
     reached_s = followed * PERIOD - within
     ahead = [attitude for t, attitude in zip(times, points.attitudes, strict=True) if t >= reached_s]
     if isinstance(left, Points):

@@ -425,8 +425,8 @@ def _run(settings: Settings, duration_s: float) -> Samples:
         measured, true = plant.measure(), plant.truth()
         values = [*sent_vector(measured.attitude), *measured.rate]
         codes = [quantizer.encode(value) for quantizer, value in zip([*attitude, *rate], values, strict=True)]
-        u = controller.compute(k % 16, codes, k)
-        assert u is not None
+        controller.tick(wire.measurement.pack(k % wire.measurement.counters, codes), k)
+        u = controller.voltages
         omega_d = twin.rotation(np.array(controller.attitude)) @ np.subtract(controller.rate, controller.rate_error)
         known = true.attitude, true.rate, controller.attitude, controller.rate, controller.desired, omega_d
         rows.append([*(value for part in known for value in part), *controller.law_state["sign"]])

@@ -18,7 +18,6 @@ from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.baselines import nearer, optimal_gains, riccati
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import OwnLawSettings, law_of, own_settings
 from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.experiment import experiment
@@ -198,30 +197,6 @@ def test_the_sliding_law_moves_straight_to_its_surface() -> None:
         torque = -np.array(p.strength) * np.tanh(sigma(0) / np.array(p.layer))
         assert body.J * slope_of(sigma) == pytest.approx(torque, rel=1e-6)
         assert np.abs(torque).max() <= max(p.strength)
-
-
-def test_the_lyapunov_function_of_pid_falls_until_body_and_integral_rest() -> None:
-    """Goodarzi, Lee and Lee's: with a cross term, and the integral about the value that outweighs a steady torque."""
-    rng = np.random.default_rng(4)
-    wn, zeta, J = 2.0, 0.8, 1.1
-    body = Body(
-        "pid", rng, **tuned("pid", LawSettings(kind="pid", inertia=(J, J, J)), Response((wn,) * 3, (zeta,) * 3))
-    )
-    body.J = np.full(3, J)
-    body.p = body.p.model_copy(update={"voltage_limit": 1e6})
-    law: Any = law_of(body.p.model_copy(update={"inertia": (J, J, J)}), PERIOD, 3)
-    body.function = law_function(law)
-    c, kp, ki = body.p.attitude_share[0], body.p.kp[0], body.p.ki[0]
-    for _ in range(200):
-        at, integral, rate = moving(body, rng)
-
-        def falling(t: float, at: Any = at, integral: Array = integral, rate: Array = rate) -> float:
-            e, omega_e = at(t)
-            kept = 2 * kp * (1 - e[0]) + J * omega_e @ omega_e / 2 + c * J * e[1:] @ omega_e
-            e_I = integral + t * rate
-            return float(kept + ki / 2 * e_I @ e_I)
-
-        assert slope_of(falling) < 0
 
 
 def test_the_other_equilibrium_is_approached_only_once_it_is_nearer_by_the_hysteresis() -> None:

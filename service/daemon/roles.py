@@ -1,13 +1,18 @@
-"""Plant end of a Zenoh network, selected by `plant.via`: emulator, CAN bridge or Quanser board."""
+"""Processes beside the controller: the plant end that `plant.via` names, and the router."""
 
 from __future__ import annotations
 
+from typing import Final
+
+from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.config import Settings
 
+STATUS_EVERY_S: Final = 1.0
+
 
 def run_plant(role: Node, settings: Settings) -> None:
-    """Run the configured plant end until the role's `stop` is set.
+    """Run the configured plant end until the role's `stop` is set: emulator, CAN bridge or Quanser board.
 
     Raises:
         AeroloopError: It cannot run, in one line.
@@ -29,3 +34,18 @@ def run_plant(role: Node, settings: Settings) -> None:
 
     driver = BoardDriver(loop, wire, plant, role.stop)
     driver.run(ZenohNetwork(role, loop, driver.endpoint, plant.state_directory))
+
+
+def run_router(role: Node) -> None:
+    """Publish the router's status once a second until the role's `stop` is set; Zenoh's threads route."""
+    role.announce()
+    role.event("started", "routing")
+    while True:
+        stopped = role.stop.is_set()
+        role.status(Status(
+            role=role.role, state="stopped" if stopped else "routing", uptime_s=role.uptime_s, ticks=0, rate_hz=0.0,
+            skipped=0,
+        ))  # fmt: skip
+        if stopped:
+            return
+        role.stop.wait(STATUS_EVERY_S)

@@ -1,0 +1,386 @@
+"""One session of the controller, from the grant to its end: wait → tick → send → account.
+
+`tick_source.py` defines a tick; in lockstep the same loop runs as fast as the plant sends. After `stale_s` without a
+measurement the session is given up and nothing more is sent; the plant's watchdog does the rest. Every tick is a row of
+the trace, which is published after the command.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Thread
+from typing import Final
+
+from zenoh.handlers import RingChannel
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status, Telemetry
+from aeroloop.protocol.messages.operator import MessageError
+from aeroloop.protocol.messages.states import CONTROLLER_TABLE, Machine
+from aeroloop.protocol.messages.states import ControllerState as State
+from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
+from aeroloop.protocol.messages.trace import ControllerRow, Received, Sent, TraceWriter
+from aeroloop.protocol.runtime.node import Node
+from aeroloop.protocol.runtime.realtime import collect_garbage
+from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram
+from aeroloop.protocol.transport.link import ZenohLink
+from aeroloop.protocol.wire.transmit import UNCHANGED
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.daemon.claim import ClaimClient
+from aeroloop.service.daemon.operator_changes import OperatorChanges
+from aeroloop.service.daemon.tick_source import PlantTick, TickSource
+
+LOCKSTEP_PATIENCE_S: Final = 2.0
+"""Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
+WAIT_S: Final = 0.02
+"""How often the session is checked while nothing is received [s]."""
+STATUSES: Final = 4
+"""Statuses of the plant that wait to be read; the newest of more."""
+READ_S: Final = 0.01
+"""How often they are read [s]."""
+STALL_TICKS: Final = 10
+"""Ticks missed in a row that cause a warning."""
+REPORT_S: Final = 1.0
+"""A tick that lasts longer is reported while it lasts [s]."""
+STOP_S: Final = 2.0
+"""How long a hanging tick may outlast a request to stop [s]."""
+
+
+class Shared:
+    """What one session leaves to the next: everything of the process but controller and link.
+
+    Attributes:
+        cause: Why the last session ended.
+        timing: Timing of the loop; None in lockstep.
+        age: From a measurement received to its command sent.
+    """
+
+    def __init__(self, role: Node, settings: Settings, why_none: Callable[[], str]) -> None:
+        loop, wire, law = settings.loop, settings.wire, settings.law
+        self.claims = ClaimClient(role, loop, wire, auto_arm=settings.controller.auto_arm)
+        self.machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
+        self.cause = ""
+        self.trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
+        self.changes = OperatorChanges(
+            role,
+            law,
+            settings.reference,
+            settings.controller,
+            self.trace,
+            rolls=wire.actuators > 2,
+            why_none=why_none,
+        )
+        self.plant = PlantStatus(role)
+        self.watch = LawWatch(role, f"law {law.kind}")
+        self.timing = None if loop.lockstep else LoopTiming(clock=role.clock)
+        self.age = RollingHistogram(role.clock)
+        self.counts = Counts()
+
+
+@dataclass
+class Counts:
+    """Ticks answered, frames sent and received, ticks missed, frames refused, voltages saturated, frames too late."""
+
+    ticks: int = 0
+    sent: int = 0
+    received: int = 0
+    skipped: int = 0
+    refused: int = 0
+    saturated: int = 0
+    stale: int = 0
+
+
+class Session:
+    """The session that `Shared.claims` has just been granted; `publish_status` publishes the status when it is due."""
+
+    def __init__(
+        self,
+        role: Node,
+        settings: Settings,
+        shared: Shared,
+        controller: Controller,
+        link: ZenohLink,
+        publish_status: Callable[[], None],
+    ) -> None:
+        self._role = role
+        self._clock = role.clock
+        self._shared = shared
+        self._link = link
+        self._publish_status = publish_status
+        self.controller = controller
+        self.name = shared.claims.session or ""
+        loop, own = settings.loop, settings.controller
+        self._lockstep = loop.lockstep
+        self._stale_s = own.stale_s
+        self._law_timeout_s = own.law_timeout_s
+        self._last_tick = loop.ticks(own.duration_s) - 1 if own.duration_s else None
+        self._telemetry_every = max(1, round(loop.rate_hz / own.telemetry_rate_hz))
+        self._source = TickSource(
+            link,
+            loop,
+            settings.wire,
+            own_grid=own.pace == "clock" and not loop.lockstep,
+            stale_s=own.stale_s,
+            clock=role.clock,
+        )
+        self._k = -1
+        shared.machine.fire(Trigger.GRANT)
+        shared.plant.follow(self.name)
+        shared.trace.session = self.name
+        shared.trace.state = controller.state.model_dump(mode="json")
+        shared.changes.begin(controller, self.name, shared.claims.last)
+
+    @property
+    def refused(self) -> int:
+        """Frames refused so far."""
+        return self.controller.refused + self._link.refused
+
+    @property
+    def last_answered(self) -> int | None:
+        """The last tick that was answered; None before the first."""
+        return self.controller.tick_index if self.controller.tick_index >= 0 else None
+
+    def run(self) -> bool:
+        """Run the session. True once `duration_s` is over, False if it was lost, stopped or released."""
+        last = self._clock.monotonic()
+        while self._may_continue() and (self._last_tick is None or self._k < self._last_tick):
+            now = self._source.next(min(WAIT_S, self._stale_s))
+            if now is not None and now.fresh:
+                last = self._clock.monotonic()
+            elif (reason := self._why_lost(self._clock.monotonic() - last)) is not None:
+                self._shared.machine.fire(Trigger.LOST)
+                self._shared.cause = reason
+                text = f"{reason}: stopped commanding, looking for {self._role.vehicle}"
+                self._role.event("lost", text, self.name, self.last_answered)
+                return False
+            if now is None:
+                if self._lockstep:  # a plant may pause for any time, and a request does not wait for its next step
+                    self._shared.changes.between_ticks(self._k + 1)
+                self._publish_trace_when_due()
+                self._publish_status()
+            elif now.received_as is Received.LATE or now.tick == self._k:
+                self._take_late(now)
+            else:
+                self._answer(now)
+        return self._may_continue()
+
+    def end(self) -> None:
+        """Publish what the trace holds and release the vehicle."""
+        shared = self._shared
+        if shared.timing:
+            shared.timing.pause()
+        shared.changes.end()
+        batch = shared.trace.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=True)
+        self._role.publish_bytes("trace", batch)
+        shared.claims.release()
+        self._link.close()
+        shared.counts.refused += self.refused
+        shared.counts.saturated += self.controller.saturated
+        if shared.claims.by_datagrams:
+            self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
+
+    def _may_continue(self) -> bool:
+        return not self._role.stop.is_set() and self._shared.machine.state not in (State.HOLDING, State.FAULTED)
+
+    def _why_lost(self, silent_s: float) -> str | None:
+        """Why the session is lost, if it is: the plant has ended it, is gone, or has been silent for too long."""
+        status = self._shared.plant
+        plant = status.read()
+        if plant is not None and status.granted and plant.session != self.name:
+            return f"the plant ended the session{': ' + plant.cause if plant.cause else ''}"
+        # In lockstep a granted plant may pause between steps: it is lost only when its session ends or it is gone.
+        patience = LOCKSTEP_PATIENCE_S if self._lockstep and not status.granted else self._stale_s
+        if silent_s > patience and not (self._lockstep and status.granted and plant is not None):
+            return f"no measurement for {silent_s * 1e3:.0f} ms"
+        return None
+
+    # ── a tick ──
+
+    def _answer(self, now: PlantTick) -> None:
+        shared, clock, timing = self._shared, self._clock, self._shared.timing
+        woke_ns = clock.monotonic_ns()
+        shared.changes.before_tick(now.tick, now.frame)
+        if not self._may_continue():
+            return
+        shared.watch.begun = began = clock.monotonic()
+        command = self.controller.tick(now.frame, now.tick)
+        took_s, shared.watch.begun = clock.monotonic() - began, None
+        fault = self.controller.fault
+        if took_s > self._law_timeout_s and not self._lockstep:
+            command = None
+            fault = f"law {self.controller.law.settings.kind} took {took_s:.3g} s for a tick"
+        if command or (command is not None and self._lockstep):
+            self._link.send(command)
+        self._k = now.tick
+        sent_ns = clock.monotonic_ns()
+        if timing:
+            timing.woke(now.due_ns, woke_ns)
+        shared.age.add(sent_ns - now.at_ns)
+        self._record(now, command, sent_ns)
+        self._count(now, command)
+        if command is not None or fault is not None:
+            self._advance_state(now.tick, fault)
+        if self.controller.tick_index == now.tick and now.tick % self._telemetry_every == 0:
+            self._role.publish("telemetry", telemetry_of(self.controller, self.name))
+        self._publish_status()
+        collect_garbage()
+        if timing:
+            timing.done()
+
+    def _take_late(self, late: PlantTick) -> None:
+        """A late or malformed frame, which is no tick: its levels, if it has any, hold from the next tick on."""
+        self._shared.counts.received += 1
+        self.controller.hold(late.frame)
+        if not late.fresh and late.received_as is Received.LATE:
+            self._shared.counts.stale += 1
+            text = f"measurements arrive {late.late_ns * 1e-6:.0f} ms later than the fastest: not answered"
+            self._role.warn("stale", "fault", text, self.name, late.tick)
+        self._record(late, None, 0)
+
+    def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
+        """Add a row to the trace. A command that repeats the last one is silent, in lockstep too."""
+        sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
+        if command is None:
+            sent_ns = 0
+        tick = max(now.tick, 0)
+        row = ControllerRow(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        self._shared.trace.row(row)
+        self._publish_trace_when_due()
+
+    def _publish_trace_when_due(self) -> None:
+        now_ns, trace = self._clock.monotonic_ns(), self._shared.trace
+        if trace.due(now_ns):
+            self._role.publish_bytes("trace", trace.take(now_ns, self._clock.time_ns()))
+            trace.state = self.controller.state.model_dump(mode="json")
+
+    def _count(self, now: PlantTick, command: bytes | None) -> None:
+        counts = self._shared.counts
+        self._shared.plant.read()
+        counts.ticks += 1
+        counts.received += now.frame != UNCHANGED
+        counts.sent += bool(command)
+        counts.skipped += now.missed
+        if now.missed >= STALL_TICKS:
+            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self.name, now.tick)
+
+    def _advance_state(self, tick: int, fault: str | None) -> None:
+        """Move the state machine after an answer."""
+        machine, role = self._shared.machine, self._role
+        if fault is not None:
+            machine.fire(Trigger.FAULT)
+            self._shared.cause = fault
+            role.event("fault", f"{fault}: stopped commanding until `aeroloop op arm`", self.name, tick)
+        elif self.controller.tick_index != tick:
+            if machine.state is not State.READY:
+                machine.fire(Trigger.INVALID)
+                role.warn("invalid", "fault", "no valid measurement: commands no valid value", self.name, tick)
+        elif machine.state is not State.RUNNING:
+            claimed = machine.state is State.CLAIMED
+            machine.fire(Trigger.ANSWERED)
+            if claimed:
+                by = ", its frames by datagrams" if self._shared.claims.by_datagrams else ""
+                role.event("claimed", f"{role.name} has {role.vehicle}{by}", self.name, tick)
+
+
+def telemetry_of(controller: Controller, session: str) -> Telemetry:
+    """The controller's last tick in a session."""
+    return Telemetry(
+        session=session,
+        tick=controller.tick_index,
+        counter=controller.counter,
+        attitude_error=controller.attitude_error,
+        rate_error=controller.rate_error,
+        desired=controller.desired,
+        state=controller.law_state,
+        voltages=tuple(controller.voltages),
+    )
+
+
+class PlantStatus:
+    """The plant's newest status.
+
+    Attributes:
+        granted: Whether a status has named the session that is followed.
+    """
+
+    def __init__(self, role: Node) -> None:
+        self._role = role
+        self._newest: Status | None = None
+        self._due_s = 0.0
+        self._appeared = 0  # how often the plant's token has appeared or disappeared
+        self._session = ""
+        self.granted = False
+        self._received = role.zenoh.declare_subscriber(
+            topics.key("status", role.vehicle, role="plant"), RingChannel(STATUSES)
+        )
+
+    def follow(self, session: str) -> None:
+        """Follow a new session."""
+        self._session, self.granted = session, False
+
+    def see(self, appeared: bool) -> None:
+        """Forget the plant's status once its token is gone; called when the token appears or disappears."""
+        self._appeared += 1
+        if not appeared:
+            while self._received.try_recv() is not None:  # its last ones
+                pass
+            self._newest = None
+
+    def read(self) -> Status | None:
+        """None before the first status, and once the plant is gone. What was received is read every `READ_S`."""
+        now, appeared = self._role.clock.monotonic(), self._appeared
+        if now < self._due_s:
+            return self._newest
+        self._due_s = now + READ_S
+        for _ in range(STATUSES):
+            if (sample := self._received.try_recv()) is None:
+                break
+            try:
+                status = Status.decode(sample.payload.to_bytes(), extra="ignore")
+            except MessageError:
+                self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
+                continue
+            if appeared == self._appeared:
+                self._newest = status
+            self.granted = self.granted or status.session == self._session
+        return self._newest
+
+
+class LawWatch(Thread):
+    """Watch of a law in Python: an event while a tick does not end, and the process's end if it never does.
+
+    The plant needs none of it: without commands its watchdog sets 0 V. But a loop that hangs in a user's code can
+    neither say so nor stop when it is asked to.
+
+    Attributes:
+        begun: When the tick that runs began, on the node's clock; None between ticks. The loop sets it.
+    """
+
+    def __init__(self, role: Node, law: str) -> None:
+        super().__init__(name="law watch", daemon=True)
+        self._role = role
+        self._law = law
+        self.begun: float | None = None
+
+    def run(self) -> None:
+        """Watch until the process ends."""
+        reported: float | None = None
+        stopping: float | None = None
+        while True:
+            time.sleep(0.1)
+            begun, now = self.begun, self._role.clock.monotonic()
+            stopping = (stopping or now) if self._role.stop.is_set() else None
+            if begun is None or now - begun < REPORT_S:
+                continue
+            if begun != reported:
+                reported = begun
+                self._role.event("fault", f"{self._law} has not ended a tick for {now - begun:.1f} s")
+            if stopping is not None and now - stopping > STOP_S:
+                sys.stderr.write(f"aeroloop: {self._law} does not end its tick: the process ends without it\n")
+                os._exit(1)
