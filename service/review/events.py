@@ -29,9 +29,6 @@ from aeroloop.service.review.report import FaultInterval, Mark
 MAX_MARKS: Final = 300
 """Marks of a kind and role; one more stands for the rest."""
 
-_STRETCH: Final = 4096
-"""Ticks within which a session is taken to run evenly: one in lockstep runs faster or slower than any clock."""
-
 _EVENTS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
 
@@ -120,7 +117,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
     """
     found: defaultdict[tuple[str, str], list[_Placed]] = defaultdict(list)
     trips, losses = list[str](), Counter[str]()
-    (first, last), knots, period = span, _knots(session), session.settings.loop.period
+    (first, last), clocks, period = span, _Clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
@@ -132,13 +129,13 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
                 found[role, message.kind].append(_Placed(message.tick, message.text))
             else:
                 within = of_session and message.tick is None
-                found[role, message.kind].append(_Placed(_tick_at(knots, role, at_ns, period), message.text, within))
+                found[role, message.kind].append(_Placed(clocks.tick(role, at_ns), message.text, within))
         elif isinstance(message, Loss):
             lost = topics.read_key(message.key)
             name = lost.topic.name if lost else message.key
             losses[name] += message.count
             text = f"{message.count} of {name} lost: {LOSS_REASONS[message.reason]}"
-            found["recorder", "lost"].append(_Placed(_tick_at(knots, "recorder", at_ns, period), text))
+            found["recorder", "lost"].append(_Placed(clocks.tick("recorder", at_ns), text))
     found["controller", "change"] += [_Placed(change.tick, described(change)) for change in session.changes]
     marks = list[tuple[tuple[int, float], Mark]]()
     for (role, kind), placed in found.items():
@@ -233,40 +230,31 @@ class _Placed(NamedTuple):
     within: bool = False
 
 
-_Knots = dict[str, list[tuple[int, int]]]
-"""Wall time [ns] and tick of some rows of each end, ascending: the first, the last, and at ends of batches between."""
+class _Clocks:
+    """Relation of each end's wall clock to the ticks, by its rows of the session."""
 
+    def __init__(self, session: Session) -> None:
+        self._period_ns = session.settings.loop.period * 1e9
+        self._known: dict[str, tuple[int, Array, Array]] = {}
+        for end, rows, at in (
+            ("controller", session.controller, session.at_controller),
+            ("plant", session.plant, session.at_plant),
+        ):
+            time = np.maximum(rows["received"], rows["sent"])[at]
+            known = (at >= 0) & (time >= 0)
+            if known.any():
+                walls, ticks = (time + rows["wall"][at])[known], session.k[known]
+                order, first = np.argsort(walls, kind="stable"), int(walls.min())
+                self._known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
 
-def _knots(session: Session) -> _Knots:
-    knots: _Knots = {}
-    for end, rows, at in (
-        ("controller", session.controller, session.at_controller),
-        ("plant", session.plant, session.at_plant),
-    ):
-        its = at[at >= 0]
-        if not len(its):
-            continue
-        ends = np.flatnonzero(np.diff(rows["wall"][its], append=rows["wall"][its[-1]] + 1))
-        stretches = ends[np.searchsorted(ends, np.arange(_STRETCH, len(its), _STRETCH))]
-        some = np.unique([0, *stretches, len(its) - 1])
-        time = np.maximum(rows["received"][its[some]], rows["sent"][its[some]])
-        walls, ticks = time + rows["wall"][its[some]], session.k[at >= 0][some]
-        knots[end] = sorted(zip(walls[time >= 0].tolist(), ticks[time >= 0].tolist(), strict=True))
-    return knots
-
-
-def _tick_at(knots: _Knots, role: str, at_ns: int, period: float) -> float:
-    """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
-    known = knots.get(role) or knots.get("plant") or knots.get("controller")
-    if not known:
-        return inf
-    (first_ns, first), (last_ns, last) = known[0], known[-1]
-    if at_ns <= first_ns:
-        return first + (at_ns - first_ns) / (period * 1e9)
-    if at_ns >= last_ns:
-        return last + (at_ns - last_ns) / (period * 1e9)
-    walls, ticks = zip(*((wall - first_ns, tick) for wall, tick in known), strict=True)
-    return float(np.interp(at_ns - first_ns, walls, ticks))
+    def tick(self, role: str, at_ns: int) -> float:
+        """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
+        clock = self._known.get(role) or self._known.get("plant") or self._known.get("controller")
+        if clock is None:
+            return inf
+        first, walls, ticks = clock
+        within = min(max(at_ns - first, 0), int(walls[-1]))
+        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / self._period_ns
 
 
 def _identity(fault: FaultStatus) -> tuple[str, str, int | None]:
