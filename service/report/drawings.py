@@ -286,9 +286,10 @@ def _band_labels(reports: Sequence[Report]) -> list[Json]:
 
 
 def _bands(report: Report) -> list[tuple[float, float, str]]:
-    """Shaded spans of time; one that did not end lasts to the end of its run's lines."""
+    """Faults as shaded spans of time; one that did not end lasts to the end of its run's lines."""
     last_s = float(report.time[-1]) if len(report.time) else 0.0
-    return [(band.start_s, last_s if band.end_s is None else band.end_s, band.label) for band in report.bands]
+    faults = report.findings.faults
+    return [(fault.begin_s, last_s if fault.end_s is None else fault.end_s, fault.fault) for fault in faults]
 
 
 def _plain(text: str) -> str:
