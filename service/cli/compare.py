@@ -38,7 +38,7 @@ def compare(
 
     from aeroloop.service.review.compare import Comparison, broken_limits, read_runs
     from aeroloop.service.terminal.display import share_bar
-    from aeroloop.service.terminal.side_by_side import comparison_tables
+    from aeroloop.service.terminal.log_tables import comparison_tables
 
     with guarded():
         with share_bar("reading", hidden=json) as update:

@@ -147,7 +147,8 @@ class _Bounds(NamedTuple):
     over: Integers
 
     def where(self, place: Integers) -> _Bounds:
-        return _Bounds(*(column[place] for column in self))
+        """Those at some ticks."""
+        return _Bounds._make(column[place] for column in self)
 
     def assume(self, eps: Array, omega: Array) -> Flags:
         """Whether errors of ε and ω are as assumed."""
