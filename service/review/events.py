@@ -240,10 +240,11 @@ class _Clocks:
             ("controller", session.controller, session.at_controller),
             ("plant", session.plant, session.at_plant),
         ):
-            time = np.maximum(rows["received"], rows["sent"])[at]
-            known = (at >= 0) & (time >= 0)
-            if known.any():
-                walls, ticks = (time + rows["wall"][at])[known], session.k[known]
+            time = np.maximum(rows["received"], rows["sent"])
+            has = at >= 0
+            its, ticks = at[has][time[at[has]] >= 0], session.k[has][time[at[has]] >= 0]
+            if len(its):
+                walls = (time + rows["wall"])[its]
                 order, first = np.argsort(walls, kind="stable"), int(walls.min())
                 self._known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
 

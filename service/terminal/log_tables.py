@@ -57,7 +57,7 @@ def review_account(findings: Findings) -> None:
     if findings.faults:
         console.print(_faults_table(findings.faults))
     console.print()
-    figures_table(findings.model_copy(update={"trips": [], "damages": _some(missing(findings))}))
+    figures_table(findings.model_copy(update={"trips": [], "damages": []}))
     console.print()
     if findings.timing:
         table = Table("", *PERCENTILES.values(), "", box=None, pad_edge=False, header_style="")
@@ -138,6 +138,8 @@ def sparkline(spread: Spread, width: int = 22) -> str:
 
 
 def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
+    for line in _some(missing(findings)):
+        yield "missing", line
     if findings.gap_count:
         longest = max(findings.gaps, key=lambda gap: gap.ticks)
         yield "gaps", f"{findings.gap_count}, the longest {count(longest.ticks, 'tick')} at {longest.time_s:.3f} s"

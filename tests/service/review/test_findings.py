@@ -162,7 +162,7 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
     path = rewrite(whole, tmp_path / "a.mcap", edited("controller", late))
     findings = found(rewrite(path, tmp_path / "b.mcap", edited("plant", stale)))
     assert findings.lapses == {"late": 2, "missed": 2, "stale": 1}
-    assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
+    assert Limit.parse("lapses=2").check(findings) == Check(text="lapses ≤ 2", holds=False, found="5")
 
 
 def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_are(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_a
     for since_s, until_s, lines in ((-inf, inf, 1), (0.35, 0.8, 1), (0.6, inf, 0), (-inf, 0.2, 0)):
         part = read(path, vehicle="aero", since_s=since_s, until_s=until_s).findings
         assert len(part.unseen["missing_ticks"]) == lines
-        assert (Limit.parse("gaps=100").unseen(part, []) is None) == (lines == 0)
+        assert Limit.parse("gaps=100").check(part).holds == (lines == 0)
 
 
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.C
     assert execute(["log", "review", str(whole), "--json", "--require", "latency.p50=1"]) == 1
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"][0]["holds"] is False
-    assert output.err == "aeroloop: latency.p50 is 300, more than 1\n"
+    assert output.err == "aeroloop: latency.p50 ≤ 1 µs does not hold: 300 µs\n"
 
 
 def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:

@@ -134,7 +134,7 @@ def test_a_bound_that_is_half_of_what_it_must_be_is_found_broken(
     assert one.broken_s is not None
     assert one.closest_s is not None
     assert 0 <= one.broken_s <= one.closest_s < 8.0
-    assert Limit.parse("lemma_broken=0").broken(findings) == f"lemma_broken is {theorem.broken}, more than 0"
+    assert not Limit.parse("lemma_broken=0").holds(findings)
 
 
 def truth_with(one: Said, **changed: Any) -> Said:
@@ -227,7 +227,7 @@ def test_a_run_that_satisfies_every_premise_keeps_to_what_is_proven_long_before_
     assert theorem.samples - theorem.outside["C.30"] == theorem.judged > 1400
     assert theorem.mean_square_judged > 1400
     assert (theorem.held, theorem.broken) == (True, 0)
-    assert Limit.parse("theorem=1").broken(findings) is None
+    assert Limit.parse("theorem=1").holds(findings)
 
 
 def test_a_certified_body_stays_within_the_set_that_it_entered(logs: Logs) -> None:
@@ -283,7 +283,7 @@ def test_a_statement_that_is_falsified_is_found_broken(
     not_kept: str,
 ) -> None:
     path = logs(log)
-    assert Limit.parse("theorem=1").broken(read(path).findings) is None
+    assert Limit.parse("theorem=1").holds(read(path).findings)
     monkeypatch.setattr(where, name, false)
     findings = read(path).findings
     theorem = findings.theorem
@@ -292,7 +292,8 @@ def test_a_statement_that_is_falsified_is_found_broken(
     over = {name for name, share in shares.items() if share is not None and share > 1}
     assert over | ({"lemma"} if theorem.broken else set()) == {not_kept}
     assert theorem.held is False
-    assert Limit.parse("theorem=1").broken(findings) == "theorem is 0, less than 1"
+    check = Limit.parse("theorem=1").check(findings)
+    assert (check.text, check.holds, check.found) == ("theorem ≥ 1", False, "0")
 
 
 def test_a_gap_in_true_states_or_a_lost_frame_begins_a_new_piece(logs: Logs, tmp_path: Path) -> None:
