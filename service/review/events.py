@@ -115,35 +115,36 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
 
     Marks outside of the `span` from the first to the last tick have no time.
     """
-    found: defaultdict[tuple[str, str], list[_Placed]] = defaultdict(list)
+    found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
     trips, losses = list[str](), Counter[str]()
     (first, last), clocks, period = span, _Clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
+        tick = shown = clocks.tick(role, at_ns)
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
             if message.kind == "changed" and role == "controller" and of_session:
                 continue  # the change itself is in the trace, with its tick
             if message.kind == "tripped" and role == "plant" and (of_session or not alone):
                 trips.append(message.text)
-            if of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
-                found[role, message.kind].append(_Placed(message.tick, message.text))
-            else:
-                within = of_session and message.tick is None
-                found[role, message.kind].append(_Placed(clocks.tick(role, at_ns), message.text, within))
+            if of_session and message.tick is None:  # belongs to it, though published just before or after
+                shown = min(max(tick, first), last)
+            elif of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
+                tick = shown = message.tick
+            found[role, message.kind].append((tick, shown, message.text))
         elif isinstance(message, Loss):
             lost = topics.read_key(message.key)
             name = lost.topic.name if lost else message.key
             losses[name] += message.count
             text = f"{message.count} of {name} lost: {LOSS_REASONS[message.reason]}"
-            found["recorder", "lost"].append(_Placed(clocks.tick("recorder", at_ns), text))
-    found["controller", "change"] += [_Placed(change.tick, described(change)) for change in session.changes]
+            found["recorder", "lost"].append((tick, shown, text))
+    found["controller", "change"] += [(one.tick, one.tick, described(one)) for one in session.changes]
     marks = list[tuple[tuple[int, float], Mark]]()
     for (role, kind), placed in found.items():
         kept, rest = placed[:MAX_MARKS], placed[MAX_MARKS:]
         if rest:
-            kept.append(rest[-1]._replace(text=f"{len(rest)} more, the last: {rest[-1].text}"))
-        for tick, text, within in kept:
-            shown = min(max(tick, first), last) if within else tick
+            tick, shown, text = rest[-1]
+            kept.append((tick, shown, f"{len(rest)} more, the last: {text}"))
+        for tick, shown, text in kept:
             outside = -1 if shown < first else 1 if shown > last + 1 else 0
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
@@ -222,14 +223,6 @@ def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
     return since, inf
 
 
-class _Placed(NamedTuple):
-    """A tick and a text; `within` if it belongs to the session though published just before or after."""
-
-    tick: float
-    text: str
-    within: bool = False
-
-
 class _Clocks:
     """Relation of each end's wall clock to the ticks, by its rows of the session."""
 
@@ -241,8 +234,8 @@ class _Clocks:
             ("plant", session.plant, session.at_plant),
         ):
             time = np.maximum(rows["received"], rows["sent"])
-            has = at >= 0
-            its, ticks = at[has][time[at[has]] >= 0], session.k[has][time[at[has]] >= 0]
+            its, ticks = at[at >= 0], session.k[at >= 0]
+            its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
             if len(its):
                 walls = (time + rows["wall"])[its]
                 order, first = np.argsort(walls, kind="stable"), int(walls.min())
