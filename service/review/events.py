@@ -58,9 +58,9 @@ class Messages(NamedTuple):
     truths: Truths
     malformed: Counter[str]
 
-    def statuses(self, role: str) -> list[tuple[int, Status]]:
-        """Statuses of a role with their times [ns], in order."""
-        return [(at, one) for at, whose, one in self.published if whose == role and isinstance(one, Status)]
+    def statuses(self, role: str) -> list[Status]:
+        """Statuses of a role, in order of time."""
+        return [one for _, whose, one in self.published if whose == role and isinstance(one, Status)]
 
 
 def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
@@ -153,7 +153,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
 
 def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
     """Age of measurements when used: median of all medians, largest p99 and maximum [µs]; None without."""
-    ages = [one.age_us for _, one in messages.statuses("controller") if one.session == which[1] and one.age_us]
+    ages = [one.age_us for one in messages.statuses("controller") if one.session == which[1] and one.age_us]
     if not ages:
         return None
     median = round(float(np.median([age.p50 for age in ages])), 1)
@@ -167,16 +167,14 @@ def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]
     the session's. So all intervals are known to the tick, whatever event was lost and whenever recording began.
     """
     statuses = messages.statuses("plant")
-    own = [i for i, (_, status) in enumerate(statuses) if status.session == session.which[1]]
+    own = [i for i, status in enumerate(statuses) if status.session == session.which[1]]
     if not own or not len(session.plant):
         return []
-    last = statuses[own[-1]][1]
-    later = (status for _, status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s)
-    last = next(later, last)  # the first after the session has its final counts
-    before = statuses[own[0] - 1][1] if own[0] else None
-    changed = {}
-    if before is not None and before.uptime_s <= last.uptime_s:  # else of another process
-        changed = {_identity(fault): fault.changed for fault in before.faults}
+    last = statuses[own[-1]]
+    # The first status after the session has its final counts, if it is of the same process; likewise the one before.
+    last = next((status for status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s), last)
+    before = [status for status in statuses[: own[0]][-1:] if status.uptime_s <= last.uptime_s]
+    changed = {_identity(fault): fault.changed for status in before for fault in status.faults}
     first = int(session.plant["tick"][0]) - int(session.plant["session_tick"][0])
     ticks, period, found = int(session.k[-1]) + 1, session.settings.loop.period, list[FaultInterval]()
     for fault in last.faults:

@@ -142,7 +142,7 @@ def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_an
     assert "--from S --to S" in thinned
     assert 'id="drawn"' not in page([made_report(thinned=2)])
     part = texts_of(replace(made_report(), part=(2.0, inf)))
-    assert "Judged is the part from 2 s to 10 s: figures, findings and drawings are of it alone." in part
+    assert "Judged is the part from 2 s to 10 s alone; trips, events and what is missing are of the whole log." in part
 
 
 def test_the_tiles_are_words_before_symbols_each_defined_and_fill_their_rows() -> None:
