@@ -188,7 +188,9 @@ def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_a
         assert Limit.parse("gaps=100").check(part).holds == (lines == 0)
 
 
-def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
+def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def loss(key: str, count: int, at_s: float) -> Said:
         at = START_NS + round(at_s * 1e9)
         return message_of("loss", Loss(key=key, count=count, reason="disk"), at)
@@ -206,6 +208,8 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
         (0.41, "recorder", "4 of measurement "),
         (0.51, "recorder", "1 of event lost: "),
     ]
+    assert execute(["log", "review", str(tmp_path / "a.mcap")]) == 0
+    assert "missing the recorder lost 7 messages of measurement" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
