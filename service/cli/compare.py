@@ -27,7 +27,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare the figures and the configurations of several runs, side by side."""
-    from aeroloop.service.review.requirements import Limit
+    from aeroloop.service.review.requirements import Limit, broken_limits
 
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
@@ -36,9 +36,9 @@ def compare(
     if html is not None:
         check_page(html, logs, force)
 
-    from aeroloop.service.review.compare import Comparison, broken_limits, read_runs
+    from aeroloop.service.review.compare import Comparison, read_runs
     from aeroloop.service.terminal.display import share_bar
-    from aeroloop.service.terminal.side_by_side import comparison_tables
+    from aeroloop.service.terminal.log_tables import comparison_tables
 
     with guarded():
         with share_bar("reading", hidden=json) as update:
@@ -49,7 +49,7 @@ def compare(
         typer.echo(Comparison.of(reports).model_dump_json(indent=2))
     else:
         comparison_tables(reports)
-    if broken := broken_limits(reports):
+    if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
 
 

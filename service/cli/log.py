@@ -94,7 +94,7 @@ def review(
             write_html([report], html, logs, force)
         findings = report.findings
     show(findings, json, review_account)
-    if broken := broken_limits(limits, findings):
+    if broken := broken_limits(findings):
         fail("; ".join(broken), 1)
 
 

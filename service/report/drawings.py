@@ -15,16 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from aeroloop.service.logs.session import Array
-from aeroloop.service.report.rows import grave, micros
+from aeroloop.service.report.rows import SPREADS, grave, micros
 from aeroloop.service.review.report import Line, Panel, Report
-
-SPREADS: Final = {
-    "latency": "Latency: from a measurement to the command that answers it",
-    "measurement_delay": "From the plant to the controller",
-    "command_delay": "From the controller to the plant",
-    "period": "Period between measurements",
-}
-"""Titles of distributions, in the order of drawing."""
 
 PROVED: Final = ("z_norm", "lyapunov")
 """Groups of panels in the theorem's section."""
@@ -94,16 +86,11 @@ def page_data(reports: Sequence[Report], drawn: Sequence[Drawing]) -> str:
 
 def drawings(reports: Sequence[Report]) -> Iterator[Drawing]:
     """Every drawing: distributions of durations, then the groups of panels in order."""
-    yield from (_spread(name, reports) for name in spread_names(reports))
+    had = {name for report in reports for name in report.findings.timing}
+    yield from (_spread(name, reports) for name in SPREADS if name in had)
     over_time = _shapes(reports), _band_labels(reports)
     for group in dict.fromkeys(panel.group for report in reports for panel in report.panels):
         yield _group(group, reports, *over_time)
-
-
-def spread_names(reports: Sequence[Report]) -> list[str]:
-    """Distributions that at least one run has."""
-    had = {name for report in reports for name in report.findings.timing}
-    return [*(name for name in SPREADS if name in had), *sorted(had - SPREADS.keys())]
 
 
 def period_s(report: Report) -> float | None:
@@ -286,9 +273,10 @@ def _band_labels(reports: Sequence[Report]) -> list[Json]:
 
 
 def _bands(report: Report) -> list[tuple[float, float, str]]:
-    """Shaded spans of time; one that did not end lasts to the end of its run's lines."""
+    """Faults as shaded spans of time; one that did not end lasts to the end of its run's lines."""
     last_s = float(report.time[-1]) if len(report.time) else 0.0
-    return [(band.start_s, last_s if band.end_s is None else band.end_s, band.label) for band in report.bands]
+    faults = report.findings.faults
+    return [(fault.begin_s, last_s if fault.end_s is None else fault.end_s, fault.fault) for fault in faults]
 
 
 def _plain(text: str) -> str:
@@ -334,7 +322,7 @@ def _spread(name: str, reports: Sequence[Report]) -> Drawing:
                          "range": [log10(NO_COUNT), log10(top) + 0.15]},
         "shapes": shapes, "annotations": [] if several else annotations,
     }  # fmt: skip
-    figure, title = {"data": data, "layout": layout}, SPREADS.get(name, name)
+    figure, title = {"data": data, "layout": layout}, SPREADS[name][1]
     return Drawing(f"spread-{name}", title, "timing", key if several else [], figure)
 
 

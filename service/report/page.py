@@ -12,22 +12,27 @@ from collections.abc import Sequence
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from aeroloop.service.report.drawings import drawings, page_data, period_s, spread_names
-from aeroloop.service.report.rows import THEOREM, Row, figure_rows, grave, micros, percent, seconds, shown
-from aeroloop.service.review.report import Findings, Report, TheoremFindings, differences, flat
-
-UNMET: Final = {
-    "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
-    "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
-    "C.30": "the command is saturated or missing, against (C.30)",
-    "Assumption 3": "the attitude error is larger than the certificate assumes",
-}
-"""Premises of Lemma 1 that a true state may not satisfy, and what that means."""
+from aeroloop.service.report.drawings import drawings, page_data, period_s
+from aeroloop.service.report.rows import (
+    PERCENTILES,
+    THEOREM,
+    count,
+    durations,
+    figure_rows,
+    grave,
+    micros,
+    missing,
+    percent,
+    seconds,
+    shown,
+    theorem_sentences,
+)
+from aeroloop.service.review.report import Findings, Report, differences, flat
 
 Json = dict[str, Any]
 
@@ -50,8 +55,8 @@ def page(reports: Sequence[Report]) -> str:
     environment.tests |= {"grave": grave, "known": lambda row: any(value.number is not None for value in row.values)}
     scripts = [get_plotlyjs(), (folder / "page.js").read_text(encoding="utf-8")]
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
-    rows = figure_rows([report.findings for report in reports])
-    drawn = list(drawings(reports))
+    runs, drawn = [report.findings for report in reports], list(drawings(reports))
+    rows = figure_rows(runs)
     return environment.get_template("page.html").render(
         reports=reports,
         runs=list(enumerate(reports)),
@@ -66,15 +71,14 @@ def page(reports: Sequence[Report]) -> str:
         differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),
-        missing=[unread(report.findings) for report in reports],
+        missing=[missing(run) for run in runs],
+        theorem=[theorem_sentences(run) for run in runs],
+        durations=durations(runs),
+        percentiles=[f"{name}#" for name in PERCENTILES.values()],
         judgement=judgement,
-        judged=judged,
         largest_error=largest_error,
         period_s=period_s,
         thinned=max(reports, key=lambda report: report.thinned),
-        part=next((report.part for report in reports if report.part), None),
-        spreads=spread_names(reports),
-        unjudged=unjudged,
     )
 
 
@@ -124,31 +128,6 @@ def largest_error(report: Report) -> tuple[float, float] | None:
     return None
 
 
-def unread(run: Findings) -> list[str]:
-    """What of the log is damaged, was not recorded, is unknown, or was lost by the recorder."""
-    missing = [f"not recorded: {gap}" for gap in run.missing if gap.rows]
-    lost = [f"the recorder lost {count(n, 'message')} of {topic}" for topic, n in run.losses.items()]
-    return [*run.damages, *missing, *map(str, run.unknown), *lost]
-
-
-def judged(found: TheoremFindings) -> str:
-    """How many true states judge the inequalities, in a sentence or two."""
-    if not found.samples:
-        return ""
-    left_out = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
-    by = f"the other {found.judged:,}" if left_out else "all of them"
-    return " ".join([f"{found.samples:,} true states belong to a tick.", *left_out, f"Lemma 1 is judged by {by}."])
-
-
-def unjudged(rows: Sequence[Row], run: int, verdict: str) -> dict[str, list[str]]:
-    """Figures that a run has not, by their reason; a reason that the verdict states already is left out."""
-    found: dict[str, list[str]] = {}
-    for row in rows:
-        if (why := row.values[run].why) and why != verdict.rstrip("."):
-            found.setdefault(why, []).append(row.figure.name)
-    return found
-
-
 def keys_by_section(tables: Sequence[Json]) -> dict[str, list[tuple[str, list[Any]]]]:
     """Every dotted key of each run's nested tables with its value in each run, by section."""
     flattened = [flat(table) for table in tables]
@@ -157,8 +136,3 @@ def keys_by_section(tables: Sequence[Json]) -> dict[str, list[tuple[str, list[An
         section, dot, _ = key.partition(".")
         sections.setdefault(section if dot else "", []).append((key, [table.get(key) for table in flattened]))
     return dict(sorted(sections.items()))
-
-
-def count(n: int, what: str) -> str:
-    """A number of things: `1 tick`, `2,000 ticks`."""
-    return f"{n:,} {what}" + ("" if n == 1 else "s")

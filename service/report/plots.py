@@ -55,9 +55,9 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
             for axis, panel in zip(axes, panels, strict=True):
                 _draw(axis, panel, report)
                 axis.set_ylabel(_label(panel, "^Q" if case != "continuous" else ""))
-            for band in report.bands:
+            for fault in report.findings.faults:
                 axes[0].annotate(
-                    band.label, (band.start_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
+                    fault.fault, (fault.begin_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
                     textcoords="offset points", va="top", fontsize=6,
                 )  # fmt: skip
             labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
@@ -78,9 +78,9 @@ def _draw(axis: Axes, panel: Panel, report: Report) -> None:
         stroke = DESIRED if line.desired else MEASURED if line.held else TRUE
         label = line.label.replace("θ̃", r"$\tilde{\theta}$")
         axis.plot(report.time[known], line.values[known], label=label, drawstyle=steps, **stroke)
-    for band in report.bands:
-        end_s = report.time[-1] if band.end_s is None else band.end_s
-        axis.axvspan(band.start_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
+    for fault in report.findings.faults:
+        end_s = report.time[-1] if fault.end_s is None else fault.end_s
+        axis.axvspan(fault.begin_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
 
 
 def _label(panel: Panel, quantized: str) -> str:

@@ -1,6 +1,6 @@
-"""Rows of figures of merit: a name, a unit, and each run's value in significant digits.
+"""Rows and sentences of a review: figures of merit, durations, what is missing, and what the theorem comes to.
 
-The page and the terminal show the same rows, so that a figure reads the same in both.
+The page and the terminal show the same, so that a figure reads the same in both.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from json import dumps
 from typing import Any, Final, Literal, NamedTuple
 
-from aeroloop.service.review.report import Findings, Mark
+from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
 from aeroloop.service.review.requirements import value_of
 
 
@@ -96,6 +96,25 @@ _fourth = "{:.4f}".format
 THEOREM: Final = "theorem."
 """Prefix of the theorem's keys."""
 
+SPREADS: Final = {
+    "latency": ("latency", "Latency: from a measurement to the command that answers it"),
+    "measurement_delay": ("plant to controller", "From the plant to the controller"),
+    "command_delay": ("controller to plant", "From the controller to the plant"),
+    "period": ("period", "Period between measurements"),
+}
+"""Labels and titles of distributions, in the order of drawing."""
+
+PERCENTILES: Final = {"p50": "p50", "p90": "p90", "p99": "p99", "p999": "p99.9", "max": "longest"}
+"""Percentiles of a duration that are shown, and their names."""
+
+UNMET: Final = {
+    "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
+    "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
+    "C.30": "the command is saturated or missing, against (C.30)",
+    "Assumption 3": "the attitude error is larger than the certificate assumes",
+}
+"""Premises of Lemma 1 that a true state may not satisfy, and what that means."""
+
 FIGURES: Final = (
     Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
             "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured", sums_up=True),
@@ -154,6 +173,89 @@ def figure_rows(runs: Sequence[Findings]) -> list[Row]:
     return rows
 
 
+class Duration(NamedTuple):
+    """A duration of a run: PERCENTILES as texts, and the distribution if there is one."""
+
+    run: int
+    label: str
+    percentiles: list[str]
+    spread: Spread | None
+
+
+def durations(runs: Sequence[Findings]) -> list[Duration]:
+    """Every duration that a run has, those of one kind together, the age of measurements last."""
+    found = [
+        Duration(i, label, [micros(getattr(run.timing[name], each)) for each in PERCENTILES], run.timing[name])
+        for name, (label, _) in SPREADS.items()
+        for i, run in enumerate(runs)
+        if name in run.timing
+    ]
+    ages = [(i, run.age_us) for i, run in enumerate(runs) if run.age_us]
+    return found + [
+        Duration(i, "age when used", [micros(age[each]) if each in age else "–" for each in PERCENTILES], None)
+        for i, age in ages
+    ]
+
+
+def missing(run: Findings) -> list[str]:
+    """What of the log is damaged, was not recorded, is unknown, or was lost by the recorder."""
+    lacks = [f"not recorded: {gap}" for gap in run.missing]
+    lost = [f"the recorder lost {count(n, 'message')} of {topic}" for topic, n in run.losses.items()]
+    return [*run.damages, *lacks, *map(str, run.unknown), *lost]
+
+
+def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
+    """What is proven of a run and what of it held, with whether that is good; nothing if it was not checked."""
+    if (found := run.theorem) is None:
+        return []
+    counts = {
+        "Lemma 1": found.judged,
+        "the mean square": found.mean_square_judged,
+        "the bound at every instant": found.pointwise_judged,
+    }
+    by = ", ".join(name for name, n in counts.items() if n)
+    held = {True: f"The run kept to {by}.", False: f"The run did not keep to all of {by}."}
+    told: list[tuple[bool | None, str]] = [
+        (bool(found.holds), found.verdict),
+        (found.held, "Nothing could be judged." if found.held is None else held[found.held]),
+        (None, _judged(found)),
+    ]
+    if found.mean_square_share is not None and found.spacing_s is not None:
+        text = (
+            f"∫k‖z‖² is at most {percent(found.mean_square_share)} % of V(t₀) + ∫δ_Q, at {found.mean_square_at_s:g} s"
+        )
+        told.append((None, f"{text}; {found.mean_square_judged:,} true states up to {found.spacing_s:g} s apart."))
+    if found.pointwise_share is not None:
+        text = f"‖z‖ is at most {percent(found.pointwise_share)} % of its bound, at {found.pointwise_at_s:g} s"
+        since = f"the bound judges from {found.pointwise_since_s:g} s and falls to {found.pointwise_bound:.4g}"
+        told.append((None, f"{text}; {since}."))
+    names: dict[str, list[str]] = {}
+    for row in figure_rows([run]):
+        why = row.values[0].why
+        if row.figure.key.startswith(THEOREM) and why and why != found.verdict.rstrip("."):  # which is said already
+            names.setdefault(why, []).append(row.figure.name)
+    return told + [(None, f"Not judged, since {why}: {'; '.join(of)}.") for why, of in names.items()]
+
+
+def _judged(found: TheoremFindings) -> str:
+    """From when until when a run is judged, and by how many true states."""
+    parts = [f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower time constant."]
+    if found.since_s:
+        parts.append(f"Judged from {found.since_s:g} s, when the reference had been reached.")
+    if found.until_s is not None:
+        parts.append(f"Judged until {found.until_s:g} s, where gains or reference changed.")
+    if found.samples:
+        unmet = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
+        by = f"the other {found.judged:,}" if unmet else "all of them"
+        parts += [f"{found.samples:,} true states belong to a tick.", *unmet, f"Lemma 1 is judged by {by}."]
+    if found.broken:
+        which = ", ".join(f"({check.equation}) {check.broken:,}×" for check in found.lemma if check.broken)
+        parts.append(f"It is broken: {which}.")
+    elif closest := max((check.closest or 0.0, check.equation) for check in found.lemma) if found.judged else None:
+        parts.append(f"Closest is ({closest[1]}), {percent(closest[0])} % of its bound.")
+    return " ".join(parts)
+
+
 def grave(mark: Mark) -> bool:
     """Whether an event is highlighted."""
     return mark.kind in {"tripped", "fault", "lost", "refused"}
@@ -164,3 +266,8 @@ def shown(value: Any) -> str:
     if value is None:
         return "–"
     return value if isinstance(value, str) else dumps(value, ensure_ascii=False, default=str)
+
+
+def count(n: int, what: str) -> str:
+    """A number of things: `1 tick`, `2,000 ticks`."""
+    return f"{n:,} {what}" + ("" if n == 1 else "s")

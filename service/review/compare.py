@@ -68,13 +68,3 @@ def named_apart(reports: Sequence[Report]) -> list[Report]:
             name = f"{run.name} ({n})"
         apart[name] = replace(run, name=name)
     return list(apart.values())
-
-
-def broken_limits(reports: Sequence[Report]) -> list[str]:
-    """Limits that do not hold, a line each."""
-    return [
-        f"{run.name}: {check.text} does not hold: {check.found}"
-        for run in reports
-        for check in run.findings.checks
-        if not check.holds
-    ]

@@ -29,9 +29,6 @@ from aeroloop.service.review.report import FaultInterval, Mark
 MAX_MARKS: Final = 300
 """Marks of a kind and role; one more stands for the rest."""
 
-_STRETCH: Final = 4096
-"""Ticks within which a session is taken to run evenly: one in lockstep runs faster or slower than any clock."""
-
 _EVENTS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
 
@@ -61,9 +58,9 @@ class Messages(NamedTuple):
     truths: Truths
     malformed: Counter[str]
 
-    def statuses(self, role: str) -> list[tuple[int, Status]]:
-        """Statuses of a role with their times [ns], in order."""
-        return [(at, one) for at, whose, one in self.published if whose == role and isinstance(one, Status)]
+    def statuses(self, role: str) -> list[Status]:
+        """Statuses of a role, in order of time."""
+        return [one for _, whose, one in self.published if whose == role and isinstance(one, Status)]
 
 
 def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
@@ -118,35 +115,36 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
 
     Marks outside of the `span` from the first to the last tick have no time.
     """
-    found: defaultdict[tuple[str, str], list[_Placed]] = defaultdict(list)
+    found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
     trips, losses = list[str](), Counter[str]()
-    (first, last), knots, period = span, _knots(session), session.settings.loop.period
+    (first, last), clocks, period = span, _Clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
+        tick = shown = clocks.tick(role, at_ns)
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
             if message.kind == "changed" and role == "controller" and of_session:
                 continue  # the change itself is in the trace, with its tick
             if message.kind == "tripped" and role == "plant" and (of_session or not alone):
                 trips.append(message.text)
-            if of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
-                found[role, message.kind].append(_Placed(message.tick, message.text))
-            else:
-                within = of_session and message.tick is None
-                found[role, message.kind].append(_Placed(_tick_at(knots, role, at_ns, period), message.text, within))
+            if of_session and message.tick is None:  # belongs to it, though published just before or after
+                shown = min(max(tick, first), last)
+            elif of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
+                tick = shown = message.tick
+            found[role, message.kind].append((tick, shown, message.text))
         elif isinstance(message, Loss):
             lost = topics.read_key(message.key)
             name = lost.topic.name if lost else message.key
             losses[name] += message.count
             text = f"{message.count} of {name} lost: {LOSS_REASONS[message.reason]}"
-            found["recorder", "lost"].append(_Placed(_tick_at(knots, "recorder", at_ns, period), text))
-    found["controller", "change"] += [_Placed(change.tick, described(change)) for change in session.changes]
+            found["recorder", "lost"].append((tick, shown, text))
+    found["controller", "change"] += [(one.tick, one.tick, described(one)) for one in session.changes]
     marks = list[tuple[tuple[int, float], Mark]]()
     for (role, kind), placed in found.items():
         kept, rest = placed[:MAX_MARKS], placed[MAX_MARKS:]
         if rest:
-            kept.append(rest[-1]._replace(text=f"{len(rest)} more, the last: {rest[-1].text}"))
-        for tick, text, within in kept:
-            shown = min(max(tick, first), last) if within else tick
+            tick, shown, text = rest[-1]
+            kept.append((tick, shown, f"{len(rest)} more, the last: {text}"))
+        for tick, shown, text in kept:
             outside = -1 if shown < first else 1 if shown > last + 1 else 0
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
@@ -155,7 +153,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
 
 def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
     """Age of measurements when used: median of all medians, largest p99 and maximum [µs]; None without."""
-    ages = [one.age_us for _, one in messages.statuses("controller") if one.session == which[1] and one.age_us]
+    ages = [one.age_us for one in messages.statuses("controller") if one.session == which[1] and one.age_us]
     if not ages:
         return None
     median = round(float(np.median([age.p50 for age in ages])), 1)
@@ -169,16 +167,14 @@ def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]
     the session's. So all intervals are known to the tick, whatever event was lost and whenever recording began.
     """
     statuses = messages.statuses("plant")
-    own = [i for i, (_, status) in enumerate(statuses) if status.session == session.which[1]]
+    own = [i for i, status in enumerate(statuses) if status.session == session.which[1]]
     if not own or not len(session.plant):
         return []
-    last = statuses[own[-1]][1]
-    later = (status for _, status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s)
-    last = next(later, last)  # the first after the session has its final counts
-    before = statuses[own[0] - 1][1] if own[0] else None
-    changed = {}
-    if before is not None and before.uptime_s <= last.uptime_s:  # else of another process
-        changed = {_identity(fault): fault.changed for fault in before.faults}
+    last = statuses[own[-1]]
+    # The first status after the session has its final counts, if it is of the same process; likewise the one before.
+    last = next((status for status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s), last)
+    before = [status for status in statuses[: own[0]][-1:] if status.uptime_s <= last.uptime_s]
+    changed = {_identity(fault): fault.changed for status in before for fault in status.faults}
     first = int(session.plant["tick"][0]) - int(session.plant["session_tick"][0])
     ticks, period, found = int(session.k[-1]) + 1, session.settings.loop.period, list[FaultInterval]()
     for fault in last.faults:
@@ -225,48 +221,32 @@ def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
     return since, inf
 
 
-class _Placed(NamedTuple):
-    """A tick and a text; `within` if it belongs to the session though published just before or after."""
+class _Clocks:
+    """Relation of each end's wall clock to the ticks, by its rows of the session."""
 
-    tick: float
-    text: str
-    within: bool = False
+    def __init__(self, session: Session) -> None:
+        self._period_ns = session.settings.loop.period * 1e9
+        self._known: dict[str, tuple[int, Array, Array]] = {}
+        for end, rows, at in (
+            ("controller", session.controller, session.at_controller),
+            ("plant", session.plant, session.at_plant),
+        ):
+            time = np.maximum(rows["received"], rows["sent"])
+            its, ticks = at[at >= 0], session.k[at >= 0]
+            its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
+            if len(its):
+                walls = (time + rows["wall"])[its]
+                order, first = np.argsort(walls, kind="stable"), int(walls.min())
+                self._known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
 
-
-_Knots = dict[str, list[tuple[int, int]]]
-"""Wall time [ns] and tick of some rows of each end, ascending: the first, the last, and at ends of batches between."""
-
-
-def _knots(session: Session) -> _Knots:
-    knots: _Knots = {}
-    for end, rows, at in (
-        ("controller", session.controller, session.at_controller),
-        ("plant", session.plant, session.at_plant),
-    ):
-        its = at[at >= 0]
-        if not len(its):
-            continue
-        ends = np.flatnonzero(np.diff(rows["wall"][its], append=rows["wall"][its[-1]] + 1))
-        stretches = ends[np.searchsorted(ends, np.arange(_STRETCH, len(its), _STRETCH))]
-        some = np.unique([0, *stretches, len(its) - 1])
-        time = np.maximum(rows["received"][its[some]], rows["sent"][its[some]])
-        walls, ticks = time + rows["wall"][its[some]], session.k[at >= 0][some]
-        knots[end] = sorted(zip(walls[time >= 0].tolist(), ticks[time >= 0].tolist(), strict=True))
-    return knots
-
-
-def _tick_at(knots: _Knots, role: str, at_ns: int, period: float) -> float:
-    """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
-    known = knots.get(role) or knots.get("plant") or knots.get("controller")
-    if not known:
-        return inf
-    (first_ns, first), (last_ns, last) = known[0], known[-1]
-    if at_ns <= first_ns:
-        return first + (at_ns - first_ns) / (period * 1e9)
-    if at_ns >= last_ns:
-        return last + (at_ns - last_ns) / (period * 1e9)
-    walls, ticks = zip(*((wall - first_ns, tick) for wall, tick in known), strict=True)
-    return float(np.interp(at_ns - first_ns, walls, ticks))
+    def tick(self, role: str, at_ns: int) -> float:
+        """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
+        clock = self._known.get(role) or self._known.get("plant") or self._known.get("controller")
+        if clock is None:
+            return inf
+        first, walls, ticks = clock
+        within = min(max(at_ns - first, 0), int(walls[-1]))
+        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / self._period_ns
 
 
 def _identity(fault: FaultStatus) -> tuple[str, str, int | None]:

@@ -203,13 +203,9 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Lines that share an axis.
+    """Lines that share an axis, such as `ε̃₁` of the group `attitude_error`; panels of a group stand together.
 
-    Attributes:
-        group: Their subject, such as `attitude_error`; panels of a group stand together.
-        title: Such as `Attitude error`, with the paper's number where the paper has that figure.
-        label: Of the axis, such as `ε̃₁`.
-        unit: Such as `rad/s`; `1` if it has none.
+    The title has the paper's number where the paper has that figure; the unit is `1` if there is none.
     """
 
     group: str
@@ -220,30 +216,15 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Band:
-    """A span of the law's clock [s] that is shaded on every drawing over time, with a label: such as a fault.
-
-    `end_s` is None if it did not end within the session.
-    """
-
-    start_s: float
-    end_s: float | None
-    label: str
-
-
-@dataclass(frozen=True)
 class Report:
     """A run.
 
     Attributes:
-        name: Its name.
-        findings: Its findings.
         time: Times of every line, on the law's clock [s]. Shape (n,).
         panels: What is drawn over time, in the order of the paper's figures.
         thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
             and the largest value.
-        part: The span of the law's clock that is drawn, if it is not the whole session [s].
-        bands: Shaded spans of time.
+        part: The span of the law's clock that was read, if it is not the whole session [s].
         settings: The effective configuration, as nested tables; each section is of the role that owns it.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
     """
@@ -256,7 +237,6 @@ class Report:
     settings: dict[str, Any]
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     part: tuple[float, float] | None = None
-    bands: Sequence[Band] = ()
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

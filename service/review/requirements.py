@@ -94,27 +94,24 @@ class Limit(NamedTuple):
         """The figure's value; None if it is unavailable."""
         return value_of(figures, self.path)
 
-    def broken(self, figures: Figures) -> str | None:
-        """Why it does not hold, in a line; None if it does. It does not hold for an unavailable figure."""
-        value, lower = self.value(figures), self.path in AT_LEAST
-        if value is None:
-            return f"{self.figure} is not known, so it is not {'at least' if lower else 'at most'} {self.bound:g}"
-        kept = value >= self.bound if lower else value <= self.bound
-        return None if kept else f"{self.figure} is {value:.6g}, {'less' if lower else 'more'} than {self.bound:g}"
+    def holds(self, figures: Figures) -> bool:
+        """Whether the figure is within the limit; an unavailable one is not."""
+        value = self.value(figures)
+        return value is not None and (value >= self.bound if self.path in AT_LEAST else value <= self.bound)
 
-    def unseen(self, findings: Findings, limits: Sequence[Limit]) -> str | None:
-        """What the figure does not see, in words, if it seems to hold; None where all was seen, or is permitted.
+    def unseen(self, findings: Findings, limits: Sequence[Limit]) -> str:
+        """What the figure does not see, in words, if it seems to hold; empty where all was seen, or is permitted.
 
         A limit of `missing_ticks` or `damages` among `limits` permits as many.
         """
-        permitted = {limit.path for limit in limits if limit.broken(findings) is None}
+        permitted = {limit.path for limit in limits if limit.holds(findings)}
         found = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
-        if self.broken(findings) is not None or not found:
-            return None
+        if not self.holds(findings) or not found:
+            return ""
         lines = [line for of_one in found.values() for line in of_one]
         more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
         permits = " ".join(f"--require {figure}={value_of(findings, figure):g}" for figure in found)
-        return f"but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
+        return f", but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
 
     def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
         """Whether it holds, and what was found, required together with `limits`."""
@@ -124,17 +121,11 @@ class Limit(NamedTuple):
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
         return Check(
             text=f"{self.figure} {'≥' if self.path in AT_LEAST else '≤'} {self.bound:g}{space}{unit}",
-            holds=self.broken(findings) is None and unseen is None,
-            found=found if unseen is None else f"{found}, {unseen}",
+            holds=self.holds(findings) and not unseen,
+            found=found + unseen,
         )
 
 
-def broken_limits(limits: Sequence[Limit], findings: Findings) -> list[str]:
+def broken_limits(findings: Findings) -> list[str]:
     """Limits that do not hold, a line each; one that seems to hold of a log that lacks something is one of them."""
-    lines = []
-    for limit in limits:
-        if (why := limit.broken(findings)) is not None:
-            lines.append(why)
-        elif (unseen := limit.unseen(findings, limits)) is not None:
-            lines.append(f"{limit.figure} is {limit.value(findings):.6g}, {unseen}")
-    return lines
+    return [f"{check.text} does not hold: {check.found}" for check in findings.checks if not check.holds]

@@ -24,7 +24,7 @@ from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
 from aeroloop.service.review.events import Happened, Messages, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
-from aeroloop.service.review.report import Band, Disagreement, FaultInterval, Findings, Recorded, Report, flat
+from aeroloop.service.review.report import Disagreement, FaultInterval, Findings, Recorded, Report, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
@@ -41,15 +41,8 @@ OWN_AFFAIRS: Final = (
 class Review:
     """Review of a session: the figures of merit alone, and with everything else the findings.
 
-    Attributes:
-        figures: The figures of merit.
-        findings: The findings, which have them, too.
-        settings: The session's configuration.
-        ticks: Its ticks that are judged.
-        theorem: What the theorem comes to.
-        name: Name of the run: of its file or folder, without the ending.
-        facts: Facts about software and host, by role.
-        part: From when to when the session was read, on the law's clock; None if all of it was [s].
+    The ticks are those that are judged. A run has the name of its file or folder, without the ending; its facts are
+    about software and host, by role. `part` is from when to when it was read [s]; None if all of it was.
     """
 
     figures: Figures
@@ -65,17 +58,8 @@ class Review:
         """The review as data, checked against limits, with lines of at most so many points."""
         time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
         checks = [limit.check(self.findings, limits) for limit in limits]
-        return Report(
-            name=self.name,
-            findings=self.findings.model_copy(update={"checks": checks}),
-            time=time,
-            panels=panels,
-            thinned=thinned,
-            settings=self.settings.description(),
-            facts=self.facts,
-            part=self.part,
-            bands=[Band(fault.begin_s, fault.end_s, fault.fault) for fault in self.findings.faults],
-        )
+        findings, settings = self.findings.model_copy(update={"checks": checks}), self.settings.description()
+        return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
 
 
 def read(

@@ -98,10 +98,13 @@ def check_theorem(
         met = within & ~np.any(list(unmet.values()), axis=0)
         checks, judged = [_lemma_check(one, met, at.k, period) for one in sides.values()], int(met.sum())
         if why is None:
-            seen, good = np.where(ticks.k >= since, z, 0.0), within & ~large & ~refused[place]
             own_rate = lemma.times(np.swapaxes(lemma.rotation(at.desired), 1, 2), omega_d)
             x = distance(e.plant, b, sign, theta_error, own_rate)
-            run, undecided = _guaranteed(settings, e, ticks.k, refused, seen, place, samples, good, true, x)
+            bounds = _bounds(settings, e, ticks.k, refused, np.where(ticks.k >= since, z, 0.0)).where(place)
+            off = lemma.norm((samples.q_Q - samples.q)[:, 1:]), lemma.norm(samples.omega_Q - samples.omega)
+            good = within & ~large & ~refused[place] & bounds.assume(*off)
+            states = _States(at.k, good, true[0], true[1], x)
+            run, undecided = _guaranteed(settings, e, states, bounds)
     broken = sum(one.broken for one in checks) if judged else None
     shares = [run[name] for name in ("mean_square_share", "pointwise_share") if name in run]
     radius = certificate.plant_radius if certificate is not None and certificate.holds else None
@@ -129,43 +132,82 @@ def check_theorem(
     return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, at.k, true)
 
 
-def _guaranteed(
-    settings: Settings, e: Evaluated, k: Integers, refused: Flags, seen: Array, place: Integers,
-    samples: lemma.Samples, good: Flags, true: Array, x: Array,
-) -> tuple[dict[str, Any], str | None]:  # fmt: skip
-    """Findings on the mean square and the invariant set; or none, and why.
+class _Bounds(NamedTuple):
+    """What is proven at each tick: k [1/s], ∫ δ dt so far [N·m], and the errors of ε and ω [1, rad/s] that both assume.
 
-    `k`, whether the command is `refused`, and ‖z^Q‖ as `seen` are of all ticks; the rest is of true states, at `place`.
+    `failed` counts the ticks so far that are after a gap, have no command within (C.30) or no δ; `over`, as many of
+    them as do not act any more. Shapes (n,).
     """
-    period, late, (z, V) = settings.loop.period, 0 if settings.loop.lockstep else 1, true[:2]
-    time, apart = period * k[place].astype(np.float64), np.diff(k[place]) * period
-    most_apart = period + (1.5 / settings.plant.truth_rate_hz if settings.plant.truth_rate_hz else 0.0)
+
+    rate: Array
+    delta: Array
+    most_eps: Array
+    most_omega: Array
+    failed: Integers
+    over: Integers
+
+    def where(self, place: Integers) -> _Bounds:
+        """Those at some ticks."""
+        return _Bounds._make(column[place] for column in self)
+
+    def assume(self, eps: Array, omega: Array) -> Flags:
+        """Whether errors of ε and ω are as assumed."""
+        within = np.asarray(eps <= self.most_eps * (1 + 1e-9) + 1e-12)
+        return within & (omega <= self.most_omega * (1 + 1e-9) + 1e-12)
+
+
+class _States(NamedTuple):
+    """True states: tick, whether the premises hold, ‖z‖, V [N·m], and ‖x‖ as `reach` has it. Shapes (m,)."""
+
+    k: Integers
+    good: Flags
+    z: Array
+    V: Array
+    x: Array
+
+
+def _bounds(settings: Settings, e: Evaluated, k: Integers, refused: Flags, z: Array) -> _Bounds:
+    """Bounds at ticks k with this ‖z^Q‖, at some of which the command is not within (C.30). Shapes (n,)."""
+    period, late = settings.loop.period, _late(settings)
 
     def decays(norms: Array) -> Array:
         return _by_size(norms, 8, lambda size: decay(e, size) or (nan,) * 4)
 
-    before, largest = np.concatenate([np.zeros(1 + late), seen]), np.maximum.accumulate(seen)
+    before, largest = np.concatenate([np.zeros(1 + late), z]), np.maximum.accumulate(z)
     recent = np.max([before[i : i + len(k)] for i in range(2 + late)], axis=0)
     lags = e.plant.age > (1 + late) * period * (1 + 1e-9)
     delta = decays(largest if lags else recent)[1] * period
-    # Ticks so far that are after a gap, have no command or no δ; and as many of them as do not act any more.
     failed = np.cumsum(refused | (np.diff(k, prepend=-1) != 1) | np.isnan(delta))
-    over = np.concatenate([np.zeros(1 + late), failed])[: len(k)]
+    over = np.concatenate([np.zeros(1 + late, dtype=np.int64), failed])[: len(k)]
+    rate, _, most_eps, most_omega = decays(largest)
+    return _Bounds(rate, np.cumsum(np.nan_to_num(delta)), most_eps, most_omega, failed, over)
 
-    rate, _, most_eps, most_omega = decays(largest[place])
-    good = good & (k[place] >= late) & (lemma.norm((samples.q_Q - samples.q)[:, 1:]) <= most_eps * (1 + 1e-9) + 1e-12)
-    good &= lemma.norm(samples.omega_Q - samples.omega) <= most_omega * (1 + 1e-9) + 1e-12
-    joined = good[1:] & good[:-1] & (apart <= most_apart) & (failed[place][1:] == over[place][:-1])
+
+def _late(settings: Settings) -> int:
+    """In real time the command that acts is of the tick before."""
+    return 0 if settings.loop.lockstep else 1
+
+
+def _guaranteed(
+    settings: Settings, e: Evaluated, states: _States, bounds: _Bounds
+) -> tuple[dict[str, Any], str | None]:
+    """Findings on the mean square and the invariant set, by the bounds at the true states; or none, and why."""
+    period, late, rate = settings.loop.period, _late(settings), bounds.rate
+    time, apart = period * states.k.astype(np.float64), np.diff(states.k) * period
+    most_apart = period + (1.5 / settings.plant.truth_rate_hz if settings.plant.truth_rate_hz else 0.0)
+    good = states.good & (states.k >= late)
+    joined = good[1:] & good[:-1] & (apart <= most_apart) & (bounds.failed[1:] == bounds.over[:-1])
     if not joined.any():
         if not np.isnan(rate[-1]):
             return {}, "no two true states in a row satisfy the premises, with every command between them within (C.30)"
         age = f"commands up to {e.plant.age * 1e3:.3g} ms old (rotor lag, period, transport): V need not decrease"
         return {}, "condition (C.66) fails" if e.theorem.k is None else age
-    area, grown = apart * rate[1:] * (z[:-1] ** 2 + z[1:] ** 2) / 2, np.diff(np.cumsum(np.nan_to_num(delta))[place])
+    area, grown = apart * rate[1:] * (states.z[:-1] ** 2 + states.z[1:] ** 2) / 2, np.diff(bounds.delta)
     left, right, start = np.zeros((3, len(apart)))
     for a, b in np.flatnonzero(np.diff(joined, prepend=False, append=False)).reshape(-1, 2):  # states a to b
-        left[a:b], right[a:b] = np.cumsum(area[a:b]), V[a] + np.cumsum(grown[a:b])
-        # In real time the command that acts is of the tick before, so that ‖x‖ counts which was so small twice.
+        left[a:b], right[a:b] = np.cumsum(area[a:b]), states.V[a] + np.cumsum(grown[a:b])
+        # In real time ‖x‖ counts which was so small twice, as the command that acts is of the tick before.
+        x = states.x
         starts = np.append(inf, np.maximum(x[a : b - 1], x[a + 1 : b])) if late else x[a:b]
         start[a:b] = np.minimum.accumulate(starts)
     last, bound = np.flatnonzero(joined)[-1], np.full(len(apart), inf)
@@ -178,7 +220,7 @@ def _guaranteed(
     }
     if (proven := bound < inf).any():
         found |= {"pointwise_since_s": float(time[:-1][proven][0]), "pointwise_bound": float(bound.min())}
-        found |= _closest("pointwise", z[1:][proven], bound[proven], time[1:][proven])
+        found |= _closest("pointwise", states.z[1:][proven], bound[proven], time[1:][proven])
     return found, None
 
 

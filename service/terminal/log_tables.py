@@ -1,20 +1,31 @@
-"""Terminal tables of a log: the findings of a review, the result of a replay."""
+"""Terminal tables of logs: the findings of a review, several runs side by side, the result of a replay."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
 
-from aeroloop.service.report.rows import grave
-from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
-from aeroloop.service.terminal.display import LABELS, figures_table, labelled
+from aeroloop.service.report.rows import (
+    PERCENTILES,
+    THEOREM,
+    count,
+    durations,
+    figure_rows,
+    grave,
+    missing,
+    shown,
+    theorem_sentences,
+)
+from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, Spread, differences
+from aeroloop.service.terminal.display import figures_table, labelled
 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
@@ -30,12 +41,6 @@ DISAGREEMENTS_SHOWN: Final = 5
 SESSIONS_SHOWN: Final = 9
 DAMAGES_SHOWN: Final = 20
 UNSEEN_SHOWN: Final = 3
-_TIMINGS: Final = {
-    "period": "period",
-    "latency": "latency",
-    "measurement_delay": "plant to controller",
-    "command_delay": "controller to plant",
-}
 _BARS: Final = "▁▂▃▄▅▆▇█"
 
 
@@ -52,10 +57,15 @@ def review_account(findings: Findings) -> None:
     if findings.faults:
         console.print(_faults_table(findings.faults))
     console.print()
-    figures_table(findings.model_copy(update={"trips": [], "damages": _some(findings.damages)}))
+    figures_table(findings.model_copy(update={"trips": [], "damages": []}))
     console.print()
     if findings.timing:
-        console.print(_timing_table(findings, drawn=console.width >= 80))
+        table = Table("", *PERCENTILES.values(), "", box=None, pad_edge=False, header_style="")
+        for row in durations([findings]):
+            table.add_row(
+                row.label, *row.percentiles, sparkline(row.spread) if row.spread and console.width >= 80 else ""
+            )
+        console.print(table)
         console.print()
     table = labelled()
     for label, text in _rows(findings):
@@ -63,7 +73,14 @@ def review_account(findings: Findings) -> None:
     console.print(table)
     if findings.theorem is not None:
         console.print()
-        console.print(theorem_table(findings, findings.theorem))
+        for good, text in theorem_sentences(findings):
+            style = {True: "green", False: "bold red"}.get(good, "") if good is not None else ""
+            console.print(Text(text, style=style))
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for figure, values, _ in figure_rows([findings]):
+            if figure.key.startswith(THEOREM) and values[0].number is not None:
+                table.add_row(figure.name, Text(values[0].text, justify="right"), figure.unit)
+        console.print(table)
     others = [entry for entry in since if not grave(entry[1])]
     if before or others:
         console.print()
@@ -77,27 +94,33 @@ def review_account(findings: Findings) -> None:
         console.print(checks)
 
 
+def comparison_tables(reports: Sequence[Report]) -> None:
+    """Print the figures of several runs and the differences between their configurations."""
+    console = Console()
+    figures = Table("", box=None)
+    differing = Table("differs in the configurations", box=None)
+    for report in reports:
+        figures.add_column(escape(report.name), justify="right")
+        differing.add_column(escape(report.name), overflow="fold")
+    figures.add_column("")
+    for row in figure_rows([report.findings for report in reports]):
+        figures.add_row(row.figure.name, *(value.text for value in row.values), row.figure.unit)
+    for key, values in differences(reports):
+        differing.add_row(key, *(escape(shown(value)) for value in values))
+    console.print(figures)
+    console.print()
+    console.print(differing if differing.row_count else "the configurations are the same")
+    for report in reports:
+        trips = [f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"]
+        for line in [*trips, *_some(missing(report.findings))]:
+            console.print(f"{report.name}: {line}", markup=False)
+
+
 def demo_account(figures: DemoFigures) -> None:
     """Print the faults that acted, and figures of merit."""
     if figures.faults:
         Console().print(_faults_table(figures.faults))
     figures_table(figures)
-
-
-def _timing_table(findings: Findings, *, drawn: bool) -> Table:
-    labels, unit, bars = (
-        Column(style="bold", no_wrap=True, min_width=LABELS),
-        Column(no_wrap=True),
-        Column(no_wrap=True),
-    )
-    values = (Column(name, justify="right", no_wrap=True) for name in ("p50", "p99", "p99.9", "max"))
-    table = Table(labels, *values, unit, bars, box=None, pad_edge=False, header_style="")
-    for name, spread in findings.timing.items():
-        percentiles = (spread.p50, spread.p99, spread.p999, spread.max)
-        table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread) if drawn else "")
-    if (age := findings.age_us) is not None:
-        table.add_row("age when used", f"{age['p50']:.0f}", f"{age['p99']:.0f}", "", f"{age['max']:.0f}", "µs", "")
-    return table
 
 
 def sparkline(spread: Spread, width: int = 22) -> str:
@@ -107,33 +130,28 @@ def sparkline(spread: Spread, width: int = 22) -> str:
     """
     first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
     counts = [0] * width
-    for edge, count in spread.bins:
-        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += count
+    for edge, n in spread.bins:
+        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += n
     top = log2(1 + max(counts))
-    bars = (_BARS[round(log2(1 + count) / top * (len(_BARS) - 1))] if count else " " for count in counts)
+    bars = (_BARS[round(log2(1 + n) / top * (len(_BARS) - 1))] if n else " " for n in counts)
     return "".join(bars).rstrip()
 
 
 def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
+    for line in _some(missing(findings)):
+        yield "missing", line
     if findings.gap_count:
         longest = max(findings.gaps, key=lambda gap: gap.ticks)
-        ticks = "1 tick" if longest.ticks == 1 else f"{longest.ticks} ticks"
-        yield "gaps", f"{findings.gap_count}, the longest {ticks} at {longest.time_s:.3f} s"
+        yield "gaps", f"{findings.gap_count}, the longest {count(longest.ticks, 'tick')} at {longest.time_s:.3f} s"
     else:
         yield "gaps", "none"
     shares = (f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items())
     yield "at the outermost level", ", ".join(shares)
-    for name, count in findings.invalid.items():
-        if count:
-            yield f"invalid {name}s", str(count)
-    lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
-    yield "messages lost", lost or "none reported"
-    for gap in findings.missing:
-        yield "not recorded", str(gap)
-    for unknown in findings.unknown:
-        yield "not known", str(unknown)
+    for name, n in findings.invalid.items():
+        if n:
+            yield f"invalid {name}s", str(n)
     if findings.lapses:
-        yield "irregular ticks", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
+        yield "irregular ticks", ", ".join(f"{n} {name}" for name, n in findings.lapses.items())
     if findings.clock_offset_us is not None:
         first, last = findings.clock_offset_us
         yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
@@ -158,77 +176,6 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
 
 def _utc(started: str) -> str:
     return started.replace("T", " ").replace("+00:00", " UTC")
-
-
-def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
-    """The theorem's bounds beside the run's values."""
-    table, nothing = labelled(), found.verdict.rstrip(".")
-
-    def row(label: str, name: str, form: Callable[[float], str]) -> None:
-        value = getattr(found, name)
-        reason = findings.reasons.get(f"theorem.{name}", "not available")
-        if value is None and reason == nothing:
-            return  # the certificate's row says so
-        table.add_row(label, Text(f"— ({reason})" if value is None else form(value)))
-
-    table.add_row("certificate", Text(found.verdict, style="" if found.holds else "bold red"))
-    if findings.reasons.get("theorem.held") != nothing:
-        table.add_row("this run", Text(*_held(findings, found)))
-    row("mean square", "mean_square_share", lambda share: _mean_square(found, share))
-    row("every instant", "pointwise_share", lambda share: _pointwise(found, share))
-    if findings.reasons.get("theorem.broken") != nothing:
-        table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))
-    since = f"since {found.since_s + found.transient_s:.3g} s"
-    row(f"largest ‖z‖ {since}", "z_norm", "{:.4f}".format)
-    row(f"largest error {since}", "error_deg", "{:.2f}°".format)
-    if found.true_z_norm is not None and found.true_error_deg is not None:
-        table.add_row("of the true state", f"‖z‖ {found.true_z_norm:.4f}, error {found.true_error_deg:.2f}°")
-    if found.since_s:
-        table.add_row("judged from", f"{found.since_s:g} s, when the reference had been reached")
-    if found.until_s is not None:
-        table.add_row("judged until", f"{found.until_s:g} s, where gains or reference changed")
-    return table
-
-
-def _held(findings: Findings, found: TheoremFindings) -> tuple[str, str]:
-    """Whether the run kept to all that could be judged, in words and in a style."""
-    if found.held is None:
-        return f"— ({findings.reasons.get('theorem.held', 'not available')})", ""
-    counts = (
-        ("Lemma 1", found.judged),
-        ("the mean square", found.mean_square_judged),
-        ("the bound at every instant", found.pointwise_judged),
-    )
-    by = ", ".join(name for name, count in counts if count)
-    return (f"✓ kept to {by}", "green") if found.held else (f"✗ does not keep to all of {by}", "bold red")
-
-
-def _mean_square(found: TheoremFindings, share: float) -> str:
-    by = f"{found.mean_square_judged} true states up to {found.spacing_s:g} s apart"
-    return f"∫k‖z‖² is at most {_percent(share)} of V(t₀) + ∫δ_Q, at {found.mean_square_at_s:g} s; {by}"
-
-
-def _pointwise(found: TheoremFindings, share: float) -> str:
-    return (
-        f"‖z‖ is at most {_percent(share)} of its bound, at {found.pointwise_at_s:g} s; the bound judges from "
-        f"{found.pointwise_since_s:g} s and falls to {found.pointwise_bound:.4g}"
-    )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
-
-
-def _lemma(findings: Findings, found: TheoremFindings) -> str:
-    """Lemma 1 in one line: the closest or the broken inequalities, and the number of states checked."""
-    if found.broken is None:
-        return f"— ({findings.reasons.get('theorem.broken', 'not available')})"
-    by = f"the {found.judged} of {found.samples} true states that satisfy its premises"
-    if found.broken:
-        which = ", ".join(f"({check.equation}) {check.broken}×" for check in found.lemma if check.broken)
-        return f"broken: {which}, of {by}"
-    closest = max(found.lemma, key=lambda check: check.closest or 0.0)
-    return f"holds at {by}; closest is ({closest.equation}), {100 * (closest.closest or 0.0):.0f} % of its bound"
 
 
 def _faults_table(faults: Sequence[FaultInterval]) -> Table:
@@ -270,7 +217,7 @@ def _marks_table(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, 
     """Events that do not matter, after the last few from before the session; earlier ones are counted in one line."""
     table = _marks()
     if earlier := Counter(mark.kind for _, mark in before[:-BEFORE_SHOWN]):
-        counts = ", ".join(f"{count} {kind}" for kind, count in earlier.items())
+        counts = ", ".join(f"{n} {kind}" for kind, n in earlier.items())
         table.add_row(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all")
     for when, mark in [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]:
         table.add_row(when, mark.role, mark.kind, Text(mark.text))
@@ -302,39 +249,33 @@ def replay_table(replay: Replay) -> None:
         counts = str(session.ticks), str(session.differ)
         table.add_row(f"{session.vehicle}/{session.session}", first_tick, *counts, rms, largest, efforts)
     console.print(table)
-    for session in replay.sessions:
-        if (first := session.first_difference) is not None:
-            console.print(
-                f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): "
-                f"{first.logged} logged, {first.computed} computed"
-            )
-    for plant in replay.plants:
-        if (other := plant.first_difference) is not None:
-            console.print(
-                f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
-                f"logged, {other.computed} computed"
-            )
-    for end_name, lines in replay.details.items():
-        for line in lines:
-            console.print(f"{end_name}: {line}", markup=False, soft_wrap=True)
-    ends: dict[End, EndReplay | None] = {"controller": replay.controller, "plant": replay.plant}
-    for name, end in ends.items():
-        if end is None:
-            reason, unseen = replay.reasons[name], replay.unseen.get(name, [])
-            more = _some([line for line in unseen if reason not in line], UNSEEN_SHOWN)
-            not_compared = f"; not compared: {'; '.join(more)}" if more else ""
-            console.print(f"{name}: not replayed: {reason}{not_compared}", markup=False, soft_wrap=True)
-        else:
-            console.print(f"{name}: {_replayed(replay, name, end)}", markup=False, soft_wrap=True)
-    named = {line for lines in replay.unseen.values() for line in lines}
-    for line in _some([line for line in replay.damages if line not in named]):
-        console.print(f"not read: {line}", markup=False, soft_wrap=True)
+    lines = [
+        f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): {first.logged} logged, "
+        f"{first.computed} computed"
+        for session in replay.sessions
+        if (first := session.first_difference) is not None
+    ]
+    lines += [
+        f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} logged, "
+        f"{other.computed} computed"
+        for plant in replay.plants
+        if (other := plant.first_difference) is not None
+    ]
+    lines += [f"{end}: {line}" for end, details in replay.details.items() for line in details]
+    lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
+    named = {line for unseen in replay.unseen.values() for line in unseen}
+    lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
 
 
-def _replayed(replay: Replay, name: End, end: EndReplay) -> str:
+def _replayed(replay: Replay, name: End) -> str:
     """What a replay found of an end, and in the same line what it did not compare."""
-    unseen = replay.unseen.get(name, [])
-    if end.differ:
+    end: EndReplay | None = getattr(replay, name)
+    unseen, reason = replay.unseen.get(name, []), replay.reasons.get(name, "")
+    if end is None:
+        unseen, found = [line for line in unseen if reason not in line], f"not replayed: {reason}"
+    elif end.differ:
         found = f"{end.ticks} ticks, {end.differ} differ"
     elif unseen:
         found = f"the same, byte for byte, at {end.ticks} ticks"
@@ -342,7 +283,9 @@ def _replayed(replay: Replay, name: End, end: EndReplay) -> str:
         found = f"{end.ticks} ticks, every tick is the same, byte for byte"
     if unseen:
         found += f"; not compared: {'; '.join(_some(unseen, UNSEEN_SHOWN))}"
-    elif name in replay.reasons:
-        found += f"; {replay.reasons[name]}"
+    if end is None:
+        return found
+    if reason and not unseen:
+        found += f"; {reason}"
     open_ended = [gap for gap in replay.missing if gap.end == name and not gap.rows]
     return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:UNSEEN_SHOWN])

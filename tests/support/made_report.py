@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import StreamFigures
 from aeroloop.service.review.report import (
     Check,
+    FaultInterval,
     Findings,
     Gap,
     LemmaCheck,
@@ -122,6 +124,15 @@ def made_report(
         "plant": {"host": "h"},
     }
     return Report(name, findings, time, panels, thinned, usual | (settings or {}), facts)
+
+
+def with_faults(report: Report, *faults: tuple[str, float, float | None]) -> Report:
+    """A report with faults of the plant: what, from when, until when [s]."""
+    intervals = [
+        FaultInterval(fault=fault, source="injected", begin_s=begin_s, end_s=end_s, changed=1, effect="samples shifted")
+        for fault, begin_s, end_s in faults
+    ]
+    return replace(report, findings=report.findings.model_copy(update={"faults": intervals}))
 
 
 def made_theorem(*, broken: int = 0) -> TheoremFindings:

@@ -154,7 +154,7 @@ def test_a_requirement_that_seems_met_fails_where_ticks_are_missing_or_a_file_is
     missing = sum(read(damaged).findings.missing_ticks.values())
     verdict = Verdict(capsys, "review", damaged, "--require", "z_track=1")
     assert verdict.code == 1
-    assert re.match(r"aeroloop: z_track is 0\.\d+, but not seen: ", verdict.err)
+    assert re.match(r"aeroloop: z_track ≤ 1 s does not hold: 0\.\d+ s, but not seen: ", verdict.err)
     assert all(str(gap) in verdict.err for gap in read(damaged).findings.missing)
     assert f"{damaged}: a chunk" in verdict.err
     assert f"--require missing_ticks={missing} --require damages=1 permits it" in verdict.err

@@ -15,8 +15,8 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 from aeroloop.service.report.page import page
-from aeroloop.service.review.report import Band, Check, Line, Mark, Panel, Report
-from tests.support.made_report import HELD, HOSTILE, MARKS, made_report
+from aeroloop.service.review.report import Check, Line, Mark, Panel, Report
+from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, with_faults
 
 PATIENCE_MS = 120_000
 """Nothing here is about speed; a browser on a busy machine may take its time."""
@@ -114,7 +114,7 @@ def test_every_panel_is_drawn_with_its_lines(one: Page) -> None:
 
 
 def test_events_gaps_and_bands_stand_across_every_drawing_over_time(open_page: Open) -> None:
-    opened = open_page(replace(made_report(), bands=[Band(2.0, 4.0, "gyro off"), Band(9.0, None, "wind")]))
+    opened = open_page(with_faults(made_report(), ("gyro off", 2.0, 4.0), ("wind", 9.0, None)))
     draw_all(opened)
     for name in ("attitude", "latency"):
         assert plot(opened, name, "plot.layout.shapes.map(({ path, yref }) => [path, yref])") == [

@@ -14,9 +14,10 @@ from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.report import figure_style
 from aeroloop.service.report.figure_style import FORMATS
 from aeroloop.service.report.plots import draw_figures
-from aeroloop.service.review.report import Band, Report
+from aeroloop.service.review.report import Report
 from aeroloop.service.review.review import report
 from tests.support.made_log import make_log
+from tests.support.made_report import with_faults
 
 CASES = {
     "continuous": ["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"],
@@ -87,8 +88,8 @@ def test_the_number_is_that_of_the_case(logs: dict[str, Path], tmp_path: Path, c
 
 
 @pytest.mark.usefixtures("svg_only")
-def test_bands_are_shaded_with_their_labels(quantized: Report, tmp_path: Path) -> None:
-    draw_figures(replace(only(quantized, "input"), bands=[Band(0.1, None, "gyro off")]), load(), tmp_path)
+def test_faults_are_shaded_with_their_labels(quantized: Report, tmp_path: Path) -> None:
+    draw_figures(with_faults(only(quantized, "input"), ("gyro off", 0.1, None)), load(), tmp_path)
     assert "gyro off" in texts(tmp_path / "C.11-input.svg")
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import load
-from aeroloop.service.review.compare import Comparison, broken_limits, named_apart, read_runs
+from aeroloop.service.review.compare import Comparison, named_apart, read_runs
 from aeroloop.service.review.report import Check
+from aeroloop.service.review.requirements import broken_limits
 from tests.support.made_log import make_log
 from tests.support.made_report import made_report
 
@@ -22,7 +23,7 @@ def test_runs_are_named_apart_and_what_differs_is_named() -> None:
     assert list(compared.runs) == ["a.mcap", "a.mcap (2)"]
     (differs,) = compared.differences
     assert (differs.key, list(differs.values.values())) == ("law.C2", [[0.15, 0.15, 0.15], [0.3, 0.3, 0.3]])
-    assert broken_limits(runs) == ["a.mcap (2): skipped_ticks ≤ 0 does not hold: 50"]
+    assert [broken_limits(run.findings) for run in runs] == [[], ["skipped_ticks ≤ 0 does not hold: 50"]]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.demo import DemoFigures
 from aeroloop.service.report.page import judgement, page
-from aeroloop.service.review.report import Band, FaultInterval
+from aeroloop.service.review.report import FaultInterval
 from aeroloop.service.review.review import read
 from tests.support.edited_log import edited, message_of, rewrite
 from tests.support.made_log import START_NS, make_log
@@ -64,17 +64,12 @@ def test_events_have_the_same_times_as_the_intervals_which_need_no_event(faulty:
     assert quiet.faults == findings.faults
 
 
-def test_the_verdict_the_bands_and_the_page_name_the_faults(faulty: Path) -> None:
+def test_the_verdict_and_the_page_name_the_faults(faulty: Path) -> None:
     review = read(faulty)
     found, made = judgement(review.findings), review.report()
     assert found.word == "Tracked, with faults"
     counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
     assert f"3 faults acted at the plant: {counts}." in found.because
-    assert list(made.bands) == [
-        Band(0.2, 0.6, "command:drop=0.3@0.2..0.6"),
-        Band(0.648, 0.898, "motor1:bias=0.5@0.05"),
-        Band(0.8, 0.898, "rate:noise=0.001@0.8"),
-    ]
     html = page([made])
     row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
     for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.service.config import load
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.logs.table import euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.events import Truths
 from aeroloop.service.review.panels import outline, panels_of
@@ -80,12 +78,6 @@ def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() 
     other = np.array([[-0.6, 0.0, -0.8, 0.0], [0.6, 0.0, 0.8, 0.0]])
     lines = drawn(at_rest(range(2), attitude=other, desired=np.abs(other)))
     assert lines["η", "measured"].values.tolist() == lines["η", "desired"].values.tolist() == [0.6, 0.6]
-
-
-def test_roll_pitch_and_yaw_are_the_angles_of_each_quaternion() -> None:
-    q = np.random.default_rng(1).normal(size=(200, 4))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    np.testing.assert_allclose(euler_deg(q), np.degrees([to_euler(tuple(one)) for one in q.tolist()]), atol=1e-9)
 
 
 def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_and_true_stays_beside_it() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
-from aeroloop.protocol.messages.operator import Gains
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.export import export
@@ -21,7 +19,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.compare import Comparison, read_runs
 from aeroloop.service.review.review import read, report, review
 from tests.support.edited_log import message_of, rewrite
-from tests.support.made_log import AHEAD_NS, START_NS, VEHICLE, Logged, description, lockstep, made, write
+from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, write
 
 HOUR_NS = 3_600_000_000_000
 OTHER = "beta"
@@ -184,51 +182,3 @@ def test_runs_differ_by_what_their_plants_were_and_not_by_addresses(tmp_path: Pa
         controller = load(overrides=mine)
         runs.append(write(tmp_path / f"{name}.mcap", controller, made(controller, 60), its={"plant": plant}))
     assert [one.key for one in Comparison.of(read_runs(runs)).differences] == ["plant.aero.mass"]
-
-
-def test_in_lockstep_the_exported_durations_are_empty(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))
-    export([tmp_path / "a.mcap"], "csv", tmp_path / "a.csv")
-    with (tmp_path / "a.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert {row[name] for row in rows for name in ("latency_us", "measurement_delay_us", "command_delay_us")} == {""}
-
-
-# What is said
-
-
-def test_events_that_matter_come_first(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    settings = load()
-    path = write(tmp_path / "a.mcap", settings, made(settings, 300, {20: (Gains(C2=(0.2, 0.2, 0.2)), None)}))
-    happened = [("plant", "armed", f"armed {i}") for i in range(30)]
-    happened += [("controller", "fault", f"{i} ticks missed") for i in range(5)]
-    happened += [("plant", "tripped", f"no command for {i} ms: 0 V") for i in (100, 101)]
-    more = [
-        message_of(
-            "event",
-            Event.model_validate({"role": role, "kind": kind, "text": text}),
-            START_NS + (AHEAD_NS if role == "controller" else 0) + 4 * 10**8 + i,
-        )
-        for i, (role, kind, text) in enumerate(happened)
-    ]
-    assert execute(["log", "review", str(rewrite(path, tmp_path / "b.mcap", more=more))]) == 0
-    out = " ".join(capfd.readouterr().out.split())
-    assert out.index("no command for 101 ms") < out.index("duration") < out.index("armed 0")
-    assert "0 ticks missed (and 4 more like it" in out
-    assert "no command for 100 ms: 0 V" in out
-
-
-def test_messages_of_strangers_cost_nothing_but_themselves(tmp_path: Path) -> None:
-    settings = load()
-    path = write(tmp_path / "a.mcap", settings, made(settings, 200, truth_every=10))
-    junk = [
-        message_of(topic, data, START_NS + 10**8 + i * 10 + j, role="plant")
-        for i, topic in enumerate(("event", "status", "loss", "truth", "description", "trace"))
-        for j, data in enumerate((b"", b"[" * 100_000, b"\xff", b'{"protocol": 7}'))
-    ]
-    found, clean = read(rewrite(path, tmp_path / "b.mcap", more=junk)), read(path)
-    assert found.figures.z_track == clean.figures.z_track
-    assert found.findings.theorem == clean.findings.theorem
-    assert export([tmp_path / "b.mcap"], "csv", tmp_path / "b.csv").damages[-1] == "malformed: 4 of truth"
-    for topic in ("event", "status", "loss", "truth"):
-        assert f"malformed: 4 of {topic}" in found.figures.damages
