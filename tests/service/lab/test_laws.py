@@ -15,11 +15,9 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.sweep import laws as laws_module
-from aeroloop.service.sweep import sweep
-from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
+from aeroloop.service.lab.laws import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
-from tests.support.in_this_process import InThisProcess
+from tests.support.in_this_process import run_here
 
 SLOW = load(overrides=["loop.rate_hz=100"])
 RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
@@ -28,7 +26,9 @@ RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:
     """The configuration of every combination."""
     plan, choices, *_ = compare(settings, **given, duration_s=1.0)
-    return {choice: load_over(settings, each.overrides) for choice, each in zip(choices, plan.found, strict=True)}
+    return {
+        choice: load_over(settings, each.overrides) for choice, each in zip(choices, plan.configurations, strict=True)
+    }
 
 
 def test_by_default_every_law_of_ours_flies_both_plants_calm_and_in_wind_with_two_choices_of_bits() -> None:
@@ -78,8 +78,7 @@ def test_an_unknown_choice_is_one_line(given: dict[str, Any], text: str) -> None
 def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_have_their_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (sweep, laws_module):  # what workers bring back: test_engines.py
-        monkeypatch.setattr(module, "Workers", InThisProcess)
+    run_here(monkeypatch)  # what workers bring back: test_workers.py
     out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
     laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
     few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero", "--duration", "3", "--set", "loop.rate_hz=100"]
@@ -110,18 +109,19 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     assert out.read_bytes() == before
     assert execute(["lab", "laws", *laws, *few, "--markdown"]) == 0
     text = capsys.readouterr().out
-    assert f"| {RUNAWAY} | the loop ended after" in text
+    assert f"| {RUNAWAY} | – |" in text
+    assert f"{RUNAWAY}: the loop ended after" in text
     assert "| pd | none |" not in text
 
 
 def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(law_margins, "PUSHED_S", 4.0)
     settings = load_over(SLOW, ["law.kind=pd"])
-    for lost in (False, True):
-        most = law_margins.survives(settings.description(), lost, 10.0)
-        assert most is not None
+    found = law_margins.survived(settings, 10.0)
+    for name, ticks in (("delay", round((found["delay_ms"] or 0) / 10)), ("lost", found["lost_frames"] or 0)):
         errors = [
-            law_margins.largest_error_deg(settings, *((0, ticks) if lost else (ticks, 0))) for ticks in (most, most + 1)
+            law_margins.largest_error_deg(settings, **{"delay": 0, "lost": 0, name: each})
+            for each in (ticks, ticks + 1)
         ]
         assert errors[0] <= 10 < errors[1]
-    assert law_margins.survives(settings.description(), False, 0.01) is None
+    assert law_margins.survived(settings, 0.01)["delay_ms"] is None
