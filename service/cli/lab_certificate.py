@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -14,7 +15,6 @@ from aeroloop.service.cli.common import (
     Overrides,
     guarded,
     loop_of,
-    show,
     with_bits_of,
 )
 
@@ -49,13 +49,11 @@ def certify(
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.terminal.certificate_table import certificate_table, own_certificate
-    from aeroloop.service.theorem.any_law import OwnCertificate, certify_any
+    from aeroloop.service.terminal.certificate_table import certificate_sheets
+    from aeroloop.service.terminal.show import show_result
+    from aeroloop.service.theorem.any_law import certify_any
 
     with guarded():
         result = certify_any(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
-    if isinstance(result, OwnCertificate):
-        show(result, json, own_certificate)
-        raise typer.Exit(0 if result.holds else 1)
-    show(result, json, lambda found: certificate_table(found, verbose=verbose))
+    show_result(result, partial(certificate_sheets, verbose=verbose), json=json)
     raise typer.Exit(0 if result.holds else 1)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, Literal, TypeAlias, TypeVar
 
 import typer
 from pydantic import BaseModel
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -91,33 +92,38 @@ def _in_terminal(rows: Sequence[Row], title: str, keys: int) -> None:
         console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
     if title:
         console.print(Text(title, style="italic" if rows else ""), soft_wrap=not console.is_terminal)
-    for columns in _blocks(rows, console.width, keys) if rows else ():
+    if not rows:
+        return
+    least = {name: _least(rows, name, console.width) for name in rows[0]}
+    right = dict(zip(rows[0], _right(rows), strict=True))
+    for columns in _blocks(least, console.width, keys):
         table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
-        for column, right in zip(rows[0], _right(rows), strict=True):
-            if column in columns:
-                table.add_column(
-                    column, justify="right" if right else "left", min_width=_width(rows, column, console.width)
-                )
+        whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in columns}
+        folds = sum(whole.values()) + _GAP * (len(columns) - 1) > console.width
+        for name in columns:
+            is_long = max(cell_len(row[name]) for row in rows) > least[name]
+            width = least[name] if folds and not is_long else None
+            table.add_column(name, justify="right" if right[name] else "left", width=width, min_width=least[name])
         for row in rows:
-            table.add_row(*(Text(row[column]) for column in columns))
+            table.add_row(*(Text(row[name]) for name in columns))
         console.print(table)
 
 
-def _width(rows: Sequence[Row], column: str, available: int) -> int:
-    """Least width of a column: titles and long texts fold between words, figures do not."""
-    cells = [row[column] for row in rows]
-    longest = max(map(len, cells))
-    words = (word for text in (column, *(cells if longest > available / 3 else ())) for word in text.split())
-    return max([*map(len, words), longest if longest <= available / 3 else 0])
+def _least(rows: Sequence[Row], name: str, available: int) -> int:
+    """Least width of a column: its title and texts over a third of a line fold between words, others do not."""
+    cells = [row[name] for row in rows]
+    folding = [text for text in cells if cell_len(text) > available / 3]
+    whole = [] if folding else cells
+    return max(map(cell_len, (*whole, *(word for text in (name, *folding) for word in text.split()), "")))
 
 
-def _blocks(rows: Sequence[Row], available: int, keys: int) -> list[list[str]]:
+def _blocks(least: Mapping[str, int], available: int, keys: int) -> list[list[str]]:
     """Columns of each block: all in one where they fit beside each other."""
-    names = list(rows[0])
-    first, blocks = names[:keys], [list[str]()]
-    for name in names[keys:]:
-        block = [*first, *blocks[-1], name]
-        if blocks[-1] and sum(_width(rows, each, available) + _GAP for each in block) - _GAP > available:
-            blocks.append([])
+    first, *others = [*least][:keys], *[*least][keys:]
+    blocks = [[*first]]
+    for name in others:
+        width = sum(least[each] for each in blocks[-1]) + _GAP * len(blocks[-1]) + least[name]
+        if len(blocks[-1]) > keys and width > available:
+            blocks.append([*first])
         blocks[-1].append(name)
-    return [[*first, *block] for block in blocks]
+    return blocks

@@ -44,7 +44,7 @@ def test_no_line_is_wider_than_the_terminal_and_every_figure_stands_whole_beside
 
 def test_rows_into_a_pipe_are_not_folded_at_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
     show([{"law": "a", "kbit/s": "1.0", "what that is": "word " * 25}])
-    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert len(capsys.readouterr().out.splitlines()) == 2
 
 
 def test_markdown_has_every_cell_and_numbers_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
