@@ -19,14 +19,10 @@ DECIDING: Final = (
 def certificate_sheets(
     certificate: Certificate | OwnCertificate, verbose: bool = False
 ) -> Iterator[tuple[str, list[Row]]]:
-    certificate: Certificate | OwnCertificate, verbose: bool = False
-) -> Iterator[tuple[str, list[Row]]]:
     """A certificate as tables and paragraphs, with all of its terms if verbose; of a user's law, what it says."""
     if isinstance(certificate, OwnCertificate):
-        yield (
-            certificate.verdict,
-            [{"": name, "value": str(value)} for name, value in (certificate.model_extra or {}).items()],
-        )
+        said = certificate.model_extra or {}
+        yield certificate.verdict, [{"": name, "value": str(value)} for name, value in said.items()]
         return
     yield "\n  ".join([certificate.verdict, *certificate.violated[1:]]), []
     yield "", list(_bounds(certificate))
