@@ -30,7 +30,7 @@ def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: 
     Args:
         rows: From column to text.
         title: Above the table, in a terminal and in Markdown.
-        form: For whom.
+        form: One of four.
         keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
     """
     if form == "json":

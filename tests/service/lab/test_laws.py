@@ -118,10 +118,11 @@ def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pyte
     monkeypatch.setattr(law_margins, "PUSHED_S", 4.0)
     settings = load_over(SLOW, ["law.kind=pd"])
     found = law_margins.survived(settings, 10.0)
-    for name, ticks in (("delay", round((found["delay_ms"] or 0) / 10)), ("lost", found["lost_frames"] or 0)):
-        errors = [
-            law_margins.largest_error_deg(settings, **{"delay": 0, "lost": 0, name: each})
-            for each in (ticks, ticks + 1)
-        ]
+    delay, lost = found["delay_ms"], found["lost_frames"]
+    assert delay
+    assert lost
+    ticks, frames = round(delay / 10), round(lost)
+    for kept, too_late in (((ticks, 0), (ticks + 1, 0)), ((0, frames), (0, frames + 1))):
+        errors = [law_margins.largest_error_deg(settings, *late) for late in (kept, too_late)]
         assert errors[0] <= 10 < errors[1]
     assert law_margins.survived(settings, 0.01)["delay_ms"] is None
