@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import casadi as ca
 
@@ -26,7 +26,7 @@ def in_c(function: ca.Function) -> ca.Function | None:
     try:
         with TemporaryDirectory(prefix="aeroloop-") as folder:  # what is loaded stays, without its file
             source = Path(folder, generator.generate(f"{folder}/"))
-            options = {
+            options: dict[str, Any] = {
                 "compiler": compiler,
                 "linker": compiler,
                 "compiler_flags": FLAGS,

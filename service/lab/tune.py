@@ -32,11 +32,6 @@ from aeroloop.service.theorem.any_law import certify_any
 from aeroloop.service.theorem.configured import NoTheoremError
 from aeroloop.service.theorem.extremes import BoundlessError
 
-DURATION_S: Final = 10.0
-WEIGHT: Final = 1e-7
-BUDGET: Final = 1000
-REACH: Final = 10.0
-WITHIN_DEG: Final = 10.0
 MORE: Final = 1.25
 """A limit that is not given is so many times what the configured gains have."""
 _DIGITS: Final = 4
@@ -68,30 +63,15 @@ class Case(BaseModel):
 
 
 class Ran(NamedTuple):
-    """Figures of a run.
+    """Figures of a run."""
 
-    Attributes:
-        z_track: As of `Figures` [s].
-        u_total: As of `Figures` [V²·s].
-        saturated: Part of the ticks with a voltage at its limit [1].
-        changes_per_s: Changes of a commanded voltage [1/s].
-        settled_deg: Largest error in the second half [deg].
-        lasted: Part of the time that it ran: 1, or less where it tripped [1].
-        reason: Why it ended early; None if it did not.
-    """
-
-    z_track: float
-    u_total: float
-    saturated: float
-    changes_per_s: float
-    settled_deg: float
-    lasted: float = 1.0
-    reason: str | None = None
-
-
-def largest_voltage(settings: Settings) -> float:
-    """At which a command saturates: the supply's limit, or that of its quantizer [V]."""
-    return min(settings.plant.voltage_limit, settings.wire.voltage.quantizer().outermost)
+    z_track: float  # as of `Figures` [s]
+    u_total: float  # [V²·s]
+    saturated: float  # part of the ticks with a voltage at its limit [1]
+    changes_per_s: float  # of a commanded voltage [1/s]
+    settled_deg: float  # largest error in the second half [deg]
+    lasted: float = 1.0  # part of the time that it ran, less than 1 where it tripped [1]
+    reason: str | None = None  # why it ended early
 
 
 def with_case(settings: Settings, case: Case) -> Settings:
@@ -112,13 +92,15 @@ def run_cases(settings: Settings, cases: Sequence[Case], duration_s: float) -> l
 
 def run_case(settings: Settings, duration_s: float) -> Ran:
     """Run an experiment."""
-    ticks, full = settings.loop.ticks(duration_s), largest_voltage(settings)
-    level = settings.wire.voltage.quantizer().level
+    ticks, quantizer = settings.loop.ticks(duration_s), settings.wire.voltage.quantizer()
+    full = min(settings.plant.voltage_limit, quantizer.outermost)
     largest = [0.0]
 
     def watch(_k: int, _measurement: bytes, command: bytes) -> None:  # frame by frame only
         read = settings.wire.command.unpack(command)
-        largest.append(max(abs(level(code)) for code in read[1]) if read else largest[-1])  # held without a frame
+        largest.append(
+            max(abs(quantizer.level(code)) for code in read[1]) if read else largest[-1]
+        )  # held without a frame
 
     try:
         figures, course = experiment(settings, duration_s, watch=watch)
@@ -160,6 +142,19 @@ class Summary(BaseModel):
     reason: str | None = Field(description="why the first of them did")
 
 
+class Tuned(BaseModel):
+    """A law with some gains."""
+
+    model_config = ConfigDict(frozen=True)
+
+    gains: Gains
+    training: Summary
+    held_out: Summary
+    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
+    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
+    certificate: str = Field(description="verdict of the certificate, or why the law has none")
+
+
 def limits_of(before: Summary, given: Limits) -> Limits:
     """The limits given; others are MORE times what the configured gains have, if none of their runs trips."""
     configured = {"saturated": before.saturated, "changes_per_s": before.changes_per_s}
@@ -186,21 +181,19 @@ def summary(rans: Sequence[Ran], weight: float) -> Summary:
     """Runs with the same gains in sum; the weight is of u_total [1/V²]."""
     reasons = [ran.reason for ran in rans if ran.reason]
     whole = [ran for ran in rans if not ran.reason]
-    z_track, u_total = (
-        float(np.mean([getattr(ran, name) for ran in whole])) if whole else None for name in ("z_track", "u_total")
-    )
-    settled, saturated, changes = (
-        max((getattr(ran, name) for ran in whole), default=None)
+    figures: dict[str, float | None] = {
+        name: float(np.mean([getattr(ran, name) for ran in whole])) if whole else None
+        for name in ("z_track", "u_total")
+    }
+    figures |= {
+        name: max((getattr(ran, name) for ran in whole), default=None)
         for name in ("settled_deg", "saturated", "changes_per_s")
-    )
+    }
+    z_track, u_total = figures["z_track"], figures["u_total"]
     complete = z_track is not None and u_total is not None and not reasons
     return Summary(
         cost=z_track + weight * u_total if complete else None,  # type: ignore[operator]  # they are numbers
-        z_track=z_track,
-        u_total=u_total,
-        settled_deg=settled,
-        saturated=saturated,
-        changes_per_s=changes,
+        **figures,
         trips=len(reasons),
         reason=reasons[0] if reasons else None,
     )
@@ -219,34 +212,21 @@ def worse(before: Summary, after: Summary) -> str | None:
 
 
 class TuneOptions(NamedTuple):
-    """What to search, and by what.
+    """What to search, and by what."""
 
-    Attributes:
-        names: Fields of the law's settings; its gains if empty.
-        scale: Whether a gain keeps the ratio between its elements.
-        weight: Of u_total [1/V²].
-        max_saturated, max_chatter: Limits of the constraints; None is MORE times what the configured gains have.
-        seeds: Training seeds, from 0 up.
-        winds: Parts of plant.wind.torque in training, each with every seed.
-        held_out: Cases held out: further seeds, each with a wind of its own.
-        budget: Experiments of the search, at most.
-        reach: Largest factor by which a gain may change, either way.
-        seed: The same seed finds the same.
-    """
-
-    names: Sequence[str] = ()
-    scale: bool = False
-    weight: float = WEIGHT
-    max_saturated: float | None = None
+    names: Sequence[str] = ()  # fields of the law's settings; its gains if empty
+    scale: bool = False  # whether a gain keeps the ratio between its elements
+    weight: float = 1e-7  # of u_total [1/V²]
+    max_saturated: float | None = None  # limits; None is MORE times what the configured gains have
     max_chatter: float | None = None
-    seeds: int = 2
-    winds: Sequence[float] = (0.0, 1.0)
-    held_out: int = 4
-    budget: int = BUDGET
-    duration_s: float = DURATION_S
-    reach: float = REACH
-    seed: int = 0
-    within_deg: float = WITHIN_DEG
+    seeds: int = 2  # of training, from 0 up
+    winds: Sequence[float] = (0.0, 1.0)  # parts of plant.wind.torque in training, each with every seed
+    held_out: int = 4  # cases held out: further seeds, each with a wind of its own
+    budget: int = 1000  # experiments of the search, at most
+    duration_s: float = 10.0
+    reach: float = 10.0  # largest factor by which a gain may change, either way
+    seed: int = 0  # the same seed finds the same
+    within_deg: float = 10.0  # bound of the attitude error, for the margins
 
     def training(self, emulated: bool) -> list[Case]:
         """Training cases; one for a plant that no seed and no wind changes."""
@@ -372,6 +352,28 @@ class Search:
             self._progress(self.experiments, self._options.budget)
         return [self.found[key] for key in keys]
 
+    def judged(self, each: Sequence[Gains], held_out: Sequence[Case]) -> list[Tuned]:
+        """What the search has not seen of some sets of gains: held-out cases, late commands, certificate."""
+        options, done = self._options, self.experiments
+        total = done + 2 * len(each)
+        with_gains = [_with_gains(self._settings, gains) for gains in each]
+        held = partial(run_cases, cases=held_out, duration_s=options.duration_s)
+        rans = self._workers.rows(held, list(map(run_of, with_gains)), lambda n: self._progress(done + n, total))
+        pushed = [run_of(with_case(one, self.training[0])) for one in with_gains]
+        late = partial(survived, within_deg=options.within_deg)
+        margins = self._workers.rows(late, pushed, lambda n: self._progress(done + len(each) + n, total))
+        trained = self.evaluate(each)
+        return [
+            Tuned(
+                gains=each[i],
+                training=summary(trained[i], options.weight),
+                held_out=summary(rans[i], options.weight),
+                certificate=verdict(with_gains[i]),
+                **margins[i],
+            )
+            for i in range(len(each))
+        ]
+
     def gains(self, factors: Floats) -> Gains:
         """The configured gains times the factors whose logarithms are given."""
         gains = dict(self.configured)
@@ -449,19 +451,6 @@ def _as_gain(value: Any) -> Gain | None:
 # ── before and after ──
 
 
-class Tuned(BaseModel):
-    """A law with some gains."""
-
-    model_config = ConfigDict(frozen=True)
-
-    gains: Gains
-    training: Summary
-    held_out: Summary
-    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
-    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
-    certificate: str = Field(description="verdict of the certificate, or why the law has none")
-
-
 class Tuning(BaseModel):
     """A search for gains, and what it found."""
 
@@ -511,7 +500,7 @@ def tune(
         interrupted = True
     best = search.best()
     held_out = options.held_out_cases(settings.plant.emulated)
-    before, after = _judged([search.configured, best], search, held_out, settings, options, workers, progress)
+    before, after = search.judged([search.configured, best], held_out)
     return Tuning(
         law=settings.law.kind,
         weight=options.weight,
@@ -538,37 +527,6 @@ def tune(
     )
 
 
-def _judged(
-    each: Sequence[Gains],
-    search: Search,
-    held_out: list[Case],
-    settings: Settings,
-    options: TuneOptions,
-    workers: Workers[Any],
-    progress: Progress,
-) -> list[Tuned]:
-    """What the search has not seen of some sets of gains: held-out cases, late commands, certificate."""
-    with_gains = [_with_gains(settings, gains) for gains in each]
-    done, total = search.experiments, search.experiments + 2 * len(each)
-    held = partial(run_cases, cases=held_out, duration_s=options.duration_s)
-    rans = workers.rows(held, [run_of(one) for one in with_gains], lambda count: progress(done + count, total))
-    pushed = [run_of(with_case(one, search.training[0])) for one in with_gains]
-    late = partial(survived, within_deg=options.within_deg)
-    survives = workers.rows(late, pushed, lambda count: progress(done + len(each) + count, total))
-    return [
-        Tuned(
-            gains=gains,
-            training=summary(trained, options.weight),
-            held_out=summary(ran, options.weight),
-            certificate=verdict(one),
-            **limits,
-        )
-        for gains, one, trained, ran, limits in zip(
-            each, with_gains, search.evaluate(each), rans, survives, strict=True
-        )
-    ]
-
-
 def verdict(settings: Settings) -> str:
     """The verdict of the configuration's certificate, or why its law has none."""
     try:
@@ -580,11 +538,8 @@ def verdict(settings: Settings) -> str:
 def toml_of(tuning: Tuning) -> str:
     """The gains found as a section of a configuration file, after the command's own words on what they are."""
     worse = f"# Not to be used: in the held-out set {tuning.worse}.\n" if tuning.worse else ""
-    return f"{worse}{toml({'law': {'kind': tuning.law, **_plain(tuning.after.gains)}})}"
-
-
-def _plain(gains: Gains) -> dict[str, Any]:
-    return {name: list(gain) if isinstance(gain, tuple) else gain for name, gain in gains.items()}
+    gains = tuning.after.model_dump(mode="json")["gains"]
+    return f"{worse}{toml({'law': {'kind': tuning.law, **gains}})}"
 
 
 # ── as text ──
@@ -593,22 +548,11 @@ def _plain(gains: Gains) -> dict[str, Any]:
 def sheets(tuning: Tuning) -> Sheets:
     """What the search gains in both sets of runs, what it costs, and the gains."""
     yield _outcome(tuning), []
-    yield (
-        (
-            f"{tuning.experiments} experiments of {tuning.duration_s:g} s with {tuning.candidates} sets of gains of "
-            f"law {tuning.law}; seed {tuning.seed}{'; interrupted' if tuning.interrupted else ''}."
-        ),
-        [],
-    )
+    cost = f"{tuning.experiments} experiments of {tuning.duration_s:g} s with {tuning.candidates} sets of gains"
+    yield f"{cost} of law {tuning.law}; seed {tuning.seed}{'; interrupted' if tuning.interrupted else ''}.", []
     yield "", list(_figures(tuning))
-    after = tuning.after.gains
-    yield (
-        "",
-        [
-            {"gain": name, "before": _gain(gain), "after": _gain(after[name])}
-            for name, gain in tuning.before.gains.items()
-        ],
-    )
+    both = zip(tuning.before.gains.items(), tuning.after.gains.values(), strict=True)
+    yield "", [{"gain": name, "before": _gain(old), "after": _gain(new)} for (name, old), new in both]
     yield from ((note, []) for note in _notes(tuning))
     if tuning.overrides:
         yield "\n".join(f"--set '{words}'" for words in tuning.overrides), []

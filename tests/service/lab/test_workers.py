@@ -150,6 +150,22 @@ def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
     assert out.read_bytes() == local
 
 
+def test_a_worker_with_several_threads_runs_one_experiment_at_a_time(tmp_path: Path) -> None:
+    """Threads of one process share compiled loops."""
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=4, dashboard_address=":0") as threads,
+        open_workers(f"dask:{threads.scheduler_address}") as workers,
+    ):
+        workers.rows(partial(alone, path=str(tmp_path / "busy")), rates(*range(400, 420)))
+
+
+def alone(_settings: Settings, path: str) -> None:
+    """Fails if it runs in two threads at a time."""
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+    time.sleep(0.02)
+    os.unlink(path)
+
+
 def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) -> None:
     with open_workers(f"dask:{cluster.scheduler_address}") as workers:
         work = partial(rate_over, divisor=2)
