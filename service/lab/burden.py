@@ -206,17 +206,6 @@ def bus_bits(size: int) -> int:
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 
-class Ratios(BaseModel):
-    """A point's figures over those of float64 at every tick, under the same sensors [1]."""
-
-    model_config = ConfigDict(frozen=True)
-
-    z_track: float
-    u_total: float
-    bits_per_s: float
-    can_bits_per_s: float
-
-
 class Traffic(StreamFigures):
     """Traffic of one direction under one policy, over the whole run."""
 
@@ -254,7 +243,9 @@ class Point(BaseModel):
     bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
     can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
     can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
-    against_float64: Ratios | None = None
+    against_float64: dict[str, float] | None = Field(
+        default=None, description="figures over those of float64 at every tick, under the same sensors [1]"
+    )
     pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
     reason: str | None = Field(default=None, description="why there are no figures")
 
@@ -422,11 +413,11 @@ def _compared(points: Sequence[Point], sensors: str) -> list[Point]:
     ]
 
 
-def _ratios(point: Point, baseline: Point) -> Ratios | None:
+def _ratios(point: Point, baseline: Point) -> dict[str, float] | None:
     if point.reason is not None:
         return None
-    names = Ratios.model_fields
-    return Ratios(**{name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names})
+    names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
+    return {name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names}
 
 
 def _figure(figure: float | None) -> float:
@@ -471,8 +462,9 @@ def _row(always: Point, changed: Point) -> dict[str, str]:
     ratios, out, inp = always.against_float64, changed.measurement, changed.command
     if ratios is None or out is None or inp is None:
         return name | dict.fromkeys(_COLUMNS, "–")
+    error = ratios["z_track"]
     cells = (
-        f"{_figure(always.z_track) * 1e4:.1f} (×{ratios.z_track:.{2 if ratios.z_track < 9.995 else 1}f})",
+        f"{_figure(always.z_track) * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
         f"{_figure(always.u_total):.0f}",
         f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
         _payload(always),
@@ -489,7 +481,7 @@ def _row(always: Point, changed: Point) -> dict[str, str]:
 def _payload(point: Point) -> str:
     assert point.against_float64 is not None
     star = "★ " if point.pareto else ""
-    return f"{star}{_figure(point.bits_per_s) / 1e3:.1f} ({_share(point.against_float64.bits_per_s)})"
+    return f"{star}{_figure(point.bits_per_s) / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
 
 
 def _bus(point: Point) -> str:

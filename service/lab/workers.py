@@ -101,7 +101,7 @@ def code_version() -> str:
     digest = sha256(repr([sys.version, version("numpy"), version("casadi")]).encode())
     for package in ("protocol", "plant_emulator", "service"):
         folder = Path(str(sys.modules[f"aeroloop.{package}"].__file__)).parent
-        for file in sorted(folder.rglob("*.py")):
+        for file in sorted(filter(Path.is_file, folder.rglob("*.py"))):  # an editable install may have dead links
             digest.update(f"{package}/{file.relative_to(folder)}\n".encode() + file.read_bytes())
     return f"{version('aeroloop')}+{digest.hexdigest()[:12]}"
 

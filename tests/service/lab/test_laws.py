@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.law_margins import Late, least
 from aeroloop.service.lab.laws import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
 from tests.support.in_this_process import run_here
@@ -126,3 +129,40 @@ def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pyte
         errors = [law_margins.largest_error_deg(settings, *late) for late in (kept, too_late)]
         assert errors[0] <= 10 < errors[1]
     assert law_margins.survived(settings, 0.01)["delay_ms"] is None
+
+
+class Recording(EmulatedPlant):
+    """Keeps what is in force in every period."""
+
+    def __init__(self) -> None:
+        self.actuators, self.periods = 3, list[float]()
+        self.in_force: tuple[float, ...] = (0.0,)
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.in_force = tuple(voltages)
+
+    def advance(self) -> None:
+        self.periods.append(self.in_force[0])
+
+
+@pytest.mark.parametrize(
+    ("delay", "lost", "in_force"),
+    [
+        (0, 0, [1, 2, 3, 4, 5, 6, 7]),
+        (2, 0, [0, 0, 1, 2, 3, 4, 5]),
+        (0, 2, [1, 1, 1, 4, 4, 4, 7]),
+        (1, 1, [0, 0, 2, 2, 4, 4, 6]),
+    ],
+)
+def test_a_command_acts_late_or_until_the_next_that_is_not_lost(delay: int, lost: int, in_force: list[float]) -> None:
+    body = Recording()
+    plant = Late(body, delay, lost)
+    for k in range(1, 8):
+        plant.actuate([float(k)] * 3)
+        plant.advance()
+    assert body.periods == in_force
+
+
+@pytest.mark.parametrize("first", [0, 1, 2, 9, 10, 11, 37, 80, 81, 1000])
+def test_the_search_finds_the_first_number_that_fails(first: int) -> None:
+    assert least(lambda ticks: ticks >= first, guess=10, most=100) == (first if first <= 80 else None)
