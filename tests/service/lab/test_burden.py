@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from matplotlib.image import imread
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.protocol.wire.transmit import Sender
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.burden import (
@@ -214,6 +214,7 @@ def test_the_table_states_what_the_counter_costs(document: tuple[str, Path]) -> 
 
 # ── traffic ──
 
+NO_FRAME = b""
 KIND = FrameFormat([6, 6], 4)
 CODES = np.array([(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)], float)
 PERIOD = 0.01
@@ -260,7 +261,7 @@ def test_nothing_and_nonsense_are_refused() -> None:
     with pytest.raises(ValueError, match="ticks"):
         traffic(np.empty((0, 2)), KIND, np.arange(0), PERIOD)
     with pytest.raises(ValueError, match="malformed"):
-        codes_of([KIND.pack(0, (1, 2)), SILENCE], KIND)
+        codes_of([KIND.pack(0, (1, 2)), NO_FRAME], KIND)
 
 
 @pytest.mark.parametrize(
@@ -289,7 +290,7 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
     for i, (kind, measured) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
         sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat).tolist()
-        assert [k for k, frames in enumerate(received) if frames[i] != SILENCE] == sent
+        assert [k for k, frames in enumerate(received) if frames[i] != NO_FRAME] == sent
         assert [received[k][i] for k in sent] == [said[k][i] for k in sent]
         reckoned = seen[-1][("measurement", "command")[i]]
         assert isinstance(reckoned, Traffic)
