@@ -58,24 +58,25 @@ def tables(
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = loop_of(config, overrides)
     check_engine(engine)
-    from aeroloop.service.lab.tables import markdown as as_markdown
-    from aeroloop.service.lab.tables import predict
-    from aeroloop.service.terminal.display import count_bar, paper_tables
+    from aeroloop.service.lab.tables import predict, sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
 
     with guarded(), count_bar("cells", hidden=json) as update:
         result = predict(settings, seeds, update, engine)
-    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
+    show_result(result, sheets, json=json, markdown=markdown)
 
 
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
     settings = loop_of(config, overrides)
-    from aeroloop.service.lab.calibrate import calibrate
-    from aeroloop.service.terminal.display import calibration_table, count_bar
+    from aeroloop.service.lab.calibrate import calibrate, sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
 
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = calibrate(settings, lambda runs: update(runs, None))
-    show(result, json, calibration_table)
+    show_result(result, sheets, json=json)
 
 
 def burden(
@@ -118,11 +119,9 @@ def burden(
 ) -> None:
     """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
     settings = loop_of(config, overrides)
-    from aeroloop.service.lab.burden import measure_burden
-    from aeroloop.service.lab.burden_grid import grid
-    from aeroloop.service.lab.burden_table import burden_table
-    from aeroloop.service.lab.burden_table import markdown as as_markdown
+    from aeroloop.service.lab.burden import grid, measure_burden, sheets
     from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
 
     check_engine(engine)
     with checked():
@@ -130,7 +129,7 @@ def burden(
         cells = grid(settings, bits or (), quantizer or (), sensors or ())
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = measure_burden(settings, cells, duration, update, engine)
-    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
+    show_result(result, sheets, json=json, markdown=markdown, keys=2)
     if figure is not None:
         from aeroloop.service.lab.burden_figure import draw_burden
 
@@ -142,7 +141,7 @@ def sweep(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FILE.parquet",
+            metavar="FILE.parquet|FILE.csv",
             help="Table of all experiments. Rows are kept in FILE.jsonl as they come: the same command goes on there.",
             show_default=False,
         ),
@@ -169,15 +168,15 @@ def sweep(
     """Run an experiment for every combination of values and seeds, and write a table of their figures."""
     settings = loop_of(config, overrides)
     check_engine(engine)
-    from aeroloop.service.sweep.axes import parse_axes
-    from aeroloop.service.sweep.sweep import plan, run_sweep
-    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.lab.axes import configurations, parse_axes
+    from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets
     from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.sweep_table import sweep_table
+    from aeroloop.service.terminal.show import show_result
 
     with checked():
-        planned = plan(settings, parse_axes(vary or ()), seeds, duration)
+        axes = parse_axes(vary or ())
+        planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
         check_table(out, planned, [config], force=force)
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = run_sweep(planned, out, engine=engine, progress=update)
-    show(result, json, sweep_table)
+    show_result(result, sheets, json=json)

@@ -22,7 +22,6 @@ from aeroloop.service.cli.common import (
     guarded,
     loop_of,
     new_file,
-    show,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
 
@@ -80,7 +79,7 @@ def laws(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.parquet",
+            metavar="FILE.parquet|FILE.csv",
             help="Table of all experiments. Rows are kept in FILE.jsonl: the same command goes on there.",
             show_default=False,
         ),
@@ -98,12 +97,10 @@ def laws(
     """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
     settings = loop_of(config, overrides)
     check_engine(engine)
-    from aeroloop.service.sweep.law_choices import compare
-    from aeroloop.service.sweep.laws import run_comparison
-    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.lab.laws import compare, run_comparison, sheets, table_extras
+    from aeroloop.service.lab.sweep import check_table
     from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.laws_table import laws_table
-    from aeroloop.service.terminal.laws_table import markdown as as_markdown
+    from aeroloop.service.terminal.show import show_result
 
     axes = {"laws": law, "bits": bits, "sensors": sensors, "winds": wind, "plants": plant}
     given = {name: values or () for name, values in axes.items()}
@@ -111,12 +108,12 @@ def laws(
         check_figure(figure, config, force)
         comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
         if out is not None:
-            check_table(out, comparison.plan, [config], within_deg=within, force=force)
+            check_table(out, comparison.plan, [config], more=table_extras(within), force=force)
     with guarded(), count_bar("experiments and searches", hidden=json) as update:
         result = run_comparison(comparison, out, engine, update)
-    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else laws_table)
+    show_result(result, sheets, json=json, markdown=markdown)
     if figure is not None:
-        from aeroloop.service.sweep.laws_figure import draw_laws
+        from aeroloop.service.lab.laws_figure import draw_laws
 
         with new_file(figure, config, force) as part:
             draw_laws(result, part)
@@ -178,23 +175,22 @@ def tune(
     """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
     settings = loop_of(config, overrides)
     check_engine(engine)
-    from aeroloop.service.lab.tune import toml_of, tune
-    from aeroloop.service.lab.tune_search import Plan, parse_winds
-    from aeroloop.service.lab.workers import Workers
+    from aeroloop.service.lab.tune import TuneOptions, parse_winds, sheets, toml_of, tune
+    from aeroloop.service.lab.workers import open_workers
     from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.tune_table import tune_table
+    from aeroloop.service.terminal.show import show_result
 
     with checked():
         if out is not None:
             check_output(out, [config], force=force)
-        plan = Plan(
+        options = TuneOptions(
             gain or (), scale, weight, max_saturated, max_chatter, seeds, parse_winds(winds), held_out, budget,
             duration, reach, seed, within,
         )  # fmt: skip
-    with guarded(), count_bar("experiments", hidden=json) as update, Workers(engine) as workers:
-        found = tune(settings, plan, workers, update)
-    show(found, json, tune_table)
+    with guarded(), count_bar("experiments", hidden=json) as update, open_workers(engine) as workers:
+        found = tune(settings, options, workers, update)
+    show_result(found, sheets, json=json)
     if out is not None:
         with new_file(out, config, force) as part:
             part.write_text(toml_of(found), encoding="utf-8")

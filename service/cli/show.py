@@ -33,9 +33,10 @@ def show_config(
 @group.command()
 def spec(config: Config = None, overrides: Overrides = None) -> None:
     """Print the configured wire: frames, widths and quantizer steps."""
-    from aeroloop.service.terminal.wire_table import wire_table
+    from aeroloop.service.terminal.show import show_all
+    from aeroloop.service.terminal.wire_table import wire_sheets
 
-    wire_table(settings_of(config, overrides).wire)
+    show_all(wire_sheets(settings_of(config, overrides).wire))
 
 
 @group.command()

@@ -1,40 +1,209 @@
 """Burden of a loop: error against bits over a grid of bits, quantizers, transmit policies and sensors.
 
-Each cell is one lockstep experiment. Both policies give the same run to the last bit, because an
-end that receives no frame holds its last levels; so a cell runs once, and its codes give the traffic of both policies.
-Every figure is compared with that of float64 at every tick under the same sensors. The Pareto front of the points under
-the same sensors holds those that no other point beats in error without more bits, or in bits without more error.
+Each cell is one lockstep experiment. Both policies give the same run to the last bit, because an end that receives no
+frame holds its last levels; so a cell runs once, and its codes give the traffic of both. Every figure is compared with
+that of float64 at every tick under the same sensors. On the Pareto front of the points under the same sensors are those
+that no other point beats in error without more bits, or in bits without more error.
+
+Bits range from those at which the loop begins to shake to those beyond which more gain nothing. Sensors range from
+perfect ones to a gyro with noise wider than a step: noise, more than motion, changes a level from one tick to the
+next. So besides one kind of quantizer for all signals, one choice has hysteresis on the noisy signal alone, the rate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import partial
+from itertools import product
 from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import Policy
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.transport.can_format import CLASSIC_BYTES
+from aeroloop.protocol.wire.frames import MIN_COUNTER_BITS, FrameFormat
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import Policy, Transmit
+from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
-from aeroloop.service.figures import Figures, Floats, Integers, StreamFigures
-from aeroloop.service.lab.burden_grid import SENSORS, BurdenCell, BurdenError, cell_settings
-from aeroloop.service.lab.bus import BITRATE, bus_bits, classic_frames
+from aeroloop.service.figures import Floats, Integers, StreamFigures
 from aeroloop.service.lab.experiment import LoopEndedError, experiment, heartbeat_of, sent_ticks
-from aeroloop.service.lab.workers import PROCESSES, Workers
+from aeroloop.service.lab.sweep import Progress, Row, Sheets
+from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
+
+# ── the grid ──
+
+_Bits = tuple[int | None, int | None]  # out and in; None is float64
+
+BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
+FLOAT64: Final = (None, None)
+QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
+    **{kind: (kind, kind, kind) for kind in get_args(Kind)},
+    "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
+}
+"""Kinds for ε, ω and u, by the name of the choice."""
+
+
+class BurdenError(AeroloopError):
+    """The grid cannot be run; one line with the reason."""
+
+
+class SensorChoice(NamedTuple):
+    """A choice of sensors: a description for a person, and fields of `plant.sensors`."""
+
+    text: str
+    changes: dict[str, Any]
+
+
+SENSORS: Final = {
+    "perfect": SensorChoice(
+        "the true attitude and rate, so that only quantizers come between the body and the law",
+        {"attitude": "perfect", "rate": "perfect"},
+    ),
+    "encoders": SensorChoice(
+        "encoders and their filtered derivative, as on the paper's bench",
+        {"attitude": "encoders", "rate": "derivative"},
+    ),
+    "gyro": SensorChoice(
+        "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of the 8-bit step",
+        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002},
+    ),
+    "shaken-gyro": SensorChoice(
+        "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps of 8 bits",
+        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
+    ),
+}
+"""Other fields of `plant.sensors` stay as configured."""
+
+
+class BurdenCell(NamedTuple):
+    """One experiment. Bits of None are float64; the quantizer is None where nothing is quantized."""
+
+    bits_out: int | None
+    bits_in: int | None
+    quantizer: str | None
+    sensors: str
+
+
+def grid(
+    settings: Settings, bits: Sequence[str] = (), quantizers: Sequence[str] = (), sensors: Sequence[str] = ()
+) -> list[BurdenCell]:
+    """The cells of a grid, always with float64. An empty argument selects all.
+
+    Args:
+        settings: The configuration.
+        bits: Bits out and in, such as 8/6; `cont` for float64.
+        quantizers: Names out of QUANTIZERS.
+        sensors: Names out of SENSORS.
+
+    Raises:
+        BurdenError: An unknown name, or a cell that the configuration does not allow.
+    """
+    if settings.plant.ideal:
+        raise BurdenError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
+    pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
+    kinds = _chosen("--quantizer", quantizers, QUANTIZERS)
+    levels = _chosen("--sensors", sensors, SENSORS)
+    choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
+    cells = [BurdenCell(*pair, kind, level) for level in levels for pair, kind in choices]
+    for cell in cells:
+        cell_settings(settings, cell)
+    return cells
+
+
+def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
+    """The configuration of a cell, sending at every tick.
+
+    Raises:
+        BurdenError: The bits are too few for the quantizer, or the plant has no such sensors.
+    """
+    wire, plant = settings.wire, settings.plant
+    out, inp = cell.bits_out, cell.bits_in
+    attitude, rate, voltage = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
+    try:
+        chosen = WireSpec(
+            attitude=_quantized(wire.attitude, out, attitude),
+            rate=_quantized(wire.rate, out, rate),
+            voltage=_quantized(wire.voltage, inp, voltage),
+            actuators=wire.actuators,
+            transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
+            counter_bits=wire.counter_bits,
+        )
+        sensors = plant.sensors.model_copy(update=SENSORS[cell.sensors].changes)
+        measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
+    except ValidationError as error:
+        why = problem(error, SignalSpec, WireSpec, type(plant))
+        bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
+        raise BurdenError(f"{bits} {cell.quantizer or 'float64'} with sensors {cell.sensors}: {why}") from None
+    return settings.model_copy(update={"wire": chosen, "plant": measured})
+
+
+def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> SignalSpec:
+    """A signal with other bits and another quantizer; parameters stay if the kind stays."""
+    if kind in (None, signal.kind):
+        return signal.with_bits(bits)
+    return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
+
+
+def _pair(text: str) -> _Bits:
+    words = text.split("/") if text != "cont" else [text] * 2
+    if len(words) != 2 or not all(
+        word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words
+    ):
+        raise BurdenError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
+    out, inp = (None if word == "cont" else int(word) for word in words)
+    return out, inp
+
+
+def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
+    """The names without repetitions, or all choices if there are none."""
+    for name in names:
+        if name not in choices:
+            raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
+    return list(dict.fromkeys(names or choices))
+
+
+# ── frames on a classic CAN bus ──
+
+BITRATE: Final = 1_000_000
+"""Bit rate for the load, the highest of classic CAN [bit/s]."""
+
+
+def classic_frame_bits(data_bytes: int) -> int:
+    """Bits of one classic frame of 0…8 data bytes with worst-case stuffing, interframe space included.
+
+    Besides its data, a frame with an 11-bit identifier has 34 bits under stuffing and 13 without. After five equal bits
+    the sender stuffs an opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril
+    and Lukkien, Controller Area Network schedulability analysis, 2007).
+
+    Raises:
+        ValueError: A classic frame does not hold so many bytes.
+    """
+    if not 0 <= data_bytes <= CLASSIC_BYTES:
+        raise ValueError(f"a classic CAN frame holds 0 to {CLASSIC_BYTES} bytes, not {data_bytes}")
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + (stuffed - 1) // 4 + 13
+
+
+def classic_frames(size: int) -> list[int]:
+    """Data bytes of each classic frame that a frame of the loop of `size` ≥ 1 bytes fills.
+
+    A frame of more than eight bytes goes as one CAN FD frame in this project; here it is split without a header.
+    """
+    full, rest = divmod(size, CLASSIC_BYTES)
+    return [CLASSIC_BYTES] * full + [rest] * (rest > 0)
+
+
+def bus_bits(size: int) -> int:
+    """Worst-case bits on a classic bus of a frame of the loop of `size` bytes."""
+    return sum(map(classic_frame_bits, classic_frames(size)))
+
+
+# ── points ──
 
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
-
-
-class Ratios(BaseModel):
-    """A point's figures over those of float64 at every tick, under the same sensors [1]."""
-
-    model_config = ConfigDict(frozen=True)
-
-    z_track: float
-    u_total: float
-    bits_per_s: float
-    can_bits_per_s: float
 
 
 class Traffic(StreamFigures):
@@ -74,7 +243,9 @@ class Point(BaseModel):
     bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
     can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
     can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
-    against_float64: Ratios | None = None
+    against_float64: dict[str, float] | None = Field(
+        default=None, description="figures over those of float64 at every tick, under the same sensors [1]"
+    )
     pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
     reason: str | None = Field(default=None, description="why there are no figures")
 
@@ -111,19 +282,11 @@ class Burden(BaseModel):
         return [point for point in self.points if point.sensors == sensors]
 
 
-class Observation(NamedTuple):
-    """Result of a cell's experiment; without figures if the loop ended early."""
-
-    figures: Figures | None
-    traffic: dict[Policy, tuple[Traffic, Traffic]]  # measurements and commands
-    reason: str | None = None
-
-
 def measure_burden(
     settings: Settings,
     cells: Sequence[BurdenCell],
     duration_s: float,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = lambda _done, _total: None,
     engine: str = PROCESSES,
 ) -> Burden:
     """Run a grid on every worker.
@@ -133,18 +296,17 @@ def measure_burden(
         cells: Cells to run, with float64 for each of the sensors.
         duration_s: Length of each experiment [s].
         progress: Called with experiments done and experiments in all.
-        engine: As of `Workers`.
+        engine: As of `open_workers`.
 
     Raises:
         BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
             configuration.
     """
-    jobs = [(cell_settings(settings, cell).description(), duration_s) for cell in cells]
-    report = progress or (lambda _done, _total: None)
-    report(0, len(jobs))
-    with Workers(engine) as workers:
-        results = workers.each(observe, jobs, lambda done: report(done, len(jobs)))
-    points = [point for cell, result in zip(cells, results, strict=True) for point in _points(cell, result)]
+    runs = [run_of(cell_settings(settings, cell)) for cell in cells]
+    progress(0, len(runs))
+    with open_workers(engine) as workers:
+        observed = workers.rows(partial(observe, duration_s=duration_s), runs, lambda done: progress(done, len(runs)))
+    points = [Point(**cell._asdict(), **row) for cell, rows in zip(cells, observed, strict=True) for row in rows]
     sensors = dict.fromkeys(cell.sensors for cell in cells)
     return Burden(
         duration_s=duration_s,
@@ -152,30 +314,38 @@ def measure_burden(
         heartbeat_s=heartbeat_of(settings) * settings.loop.period,
         counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in sensors},
-        points=[point for name in sensors for point in _beside_float64(points, name)],
+        points=[
+            point for name in sensors for point in _compared([point for point in points if point.sensors == name], name)
+        ],
     )
 
 
-def observe(config: dict[str, Any], duration_s: float) -> Observation:
-    """Run one cell for `duration_s` [s]; `config` dumps a configuration that sends at every tick."""
-    settings = Settings.model_validate(config)
+def observe(settings: Settings, duration_s: float) -> list[Row]:
+    """Run one cell, which sends at every tick, for `duration_s` [s]: fields of its point under each policy."""
     wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
-    kinds = wire.measurement, wire.command
     frames: list[tuple[bytes, bytes]] = []
     try:
         found = experiment(settings, duration_s, watch=lambda _k, *both: frames.append(both))
     except LoopEndedError as error:
-        return Observation(None, {}, str(error))
+        return [{"transmit": policy, "reason": str(error)} for policy in POLICIES]
+    kinds = wire.measurement, wire.command
     if found.course is not None:
         codes = [found.course.measured, found.course.commanded]
     else:
         codes = [codes_of(each, kind) for each, kind in zip(zip(*frames, strict=True), kinds, strict=True)]
-    rates: dict[Policy, tuple[Traffic, Traffic]] = {}
+    rows = []
     for policy in POLICIES:
-        sent = [sent_ticks(each, policy, heartbeat) for each in codes]
-        measurement, command = (traffic(*each, period) for each in zip(codes, kinds, sent, strict=True))
-        rates[policy] = measurement, command
-    return Observation(found.figures, rates)
+        measurement, command = (
+            traffic(each, kind, sent_ticks(each, policy, heartbeat), period)
+            for each, kind in zip(codes, kinds, strict=True)
+        )
+        both = {
+            name: getattr(measurement, name) + getattr(command, name)
+            for name in ("bits_per_s", "can_bits_per_s", "can_load")
+        }
+        figures = {"z_track": found.figures.z_track, "u_total": found.figures.u_total}
+        rows.append({"transmit": policy, "measurement": measurement, "command": command, **figures, **both})
+    return rows
 
 
 def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> Floats:
@@ -227,53 +397,130 @@ def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
 
-def _points(cell: BurdenCell, found: Observation) -> list[Point]:
-    choice = {name: getattr(cell, name) for name in ("bits_out", "bits_in", "quantizer", "sensors")}
-    if found.figures is None:
-        return [Point(**choice, transmit=policy, reason=found.reason) for policy in POLICIES]
-    points = []
-    for policy, (measurement, command) in found.traffic.items():
-        points.append(
-            Point(
-                **choice,
-                transmit=policy,
-                z_track=found.figures.z_track,
-                u_total=found.figures.u_total,
-                measurement=measurement,
-                command=command,
-                bits_per_s=measurement.bits_per_s + command.bits_per_s,
-                can_bits_per_s=measurement.can_bits_per_s + command.can_bits_per_s,
-                can_load=measurement.can_load + command.can_load,
-            )
-        )
-    return points
-
-
-def _beside_float64(points: Sequence[Point], sensors: str) -> list[Point]:
-    """The points with these sensors, compared with their baseline and with each other."""
-    mine = [point for point in points if point.sensors == sensors]
-    baseline = next(point for point in mine if point.is_baseline)
+def _compared(points: Sequence[Point], sensors: str) -> list[Point]:
+    """The points with the same sensors, compared with their baseline and with each other."""
+    baseline = next(point for point in points if point.is_baseline)
     if baseline.reason is not None:
         raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
     if not (baseline.z_track and baseline.u_total):
         raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
-    done = [point for point in mine if point.reason is None]
+    done = [point for point in points if point.reason is None]
     front = pareto_front((_figure(point.bits_per_s), _figure(point.z_track)) for point in done)
     on_front = {id(point) for point, best in zip(done, front, strict=True) if best}
     return [
         point.model_copy(update={"pareto": id(point) in on_front, "against_float64": _ratios(point, baseline)})
-        for point in mine
+        for point in points
     ]
 
 
-def _ratios(point: Point, baseline: Point) -> Ratios | None:
+def _ratios(point: Point, baseline: Point) -> dict[str, float] | None:
     if point.reason is not None:
         return None
-    names = Ratios.model_fields
-    return Ratios(**{name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names})
+    names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
+    return {name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names}
 
 
 def _figure(figure: float | None) -> float:
     """A figure of a point without a `reason`, which has all of them."""
     assert figure is not None
     return figure
+
+
+# ── as text ──
+
+_COLUMNS: Final = (
+    "z_track, 10⁻⁴ s", "u_total, V²·s", "changes/s", "every tick: kbit/s", "every tick: CAN kbit/s",
+    "on change: frames/s", "on change: ms between, mean", "least", "on change: kbit/s", "on change: CAN kbit/s",
+)  # fmt: skip
+_SPLIT: Final = "†"
+
+
+def sheets(burden: Burden) -> Sheets:
+    """A table for each of the sensors: a row is one experiment with its traffic under both policies.
+
+    A missing figure is a dash, with the reason below.
+    """
+    for name, text in burden.sensors.items():
+        points = burden.under(name)
+        yield f"sensors {name}: {text}", [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
+        reasons = [f"{point.bits} {short_name(point)}: {point.reason}." for point in points[::2] if point.reason]
+        if reasons:
+            yield "\n".join(reasons), []
+    yield from ((note, []) for note in _notes(burden))
+
+
+def short_name(point: Point) -> str:
+    """Name of a point's quantizer in a table or a legend."""
+    if point.quantizer is None:
+        return "float64"
+    return "hysteresis on ω" if point.quantizer == "hysteresis-rate" else point.quantizer.removesuffix("-uniform")
+
+
+def _row(always: Point, changed: Point) -> dict[str, str]:
+    """A row of a point at every tick, and the same sent on change."""
+    name = {"bits out/in": always.bits, "quantizer": short_name(always)}
+    ratios, out, inp = always.against_float64, changed.measurement, changed.command
+    if ratios is None or out is None or inp is None:
+        return name | dict.fromkeys(_COLUMNS, "–")
+    error = ratios["z_track"]
+    cells = (
+        f"{_figure(always.z_track) * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
+        f"{_figure(always.u_total):.0f}",
+        f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
+        _payload(always),
+        _bus(always),
+        f"{out.frames_per_s:.0f} + {inp.frames_per_s:.0f}",
+        f"{_ms(out.mean_interval_ms)} + {_ms(inp.mean_interval_ms)}",
+        f"{_ms(out.least_interval_ms, 'g')} + {_ms(inp.least_interval_ms, 'g')}",
+        _payload(changed),
+        _bus(changed),
+    )
+    return name | dict(zip(_COLUMNS, cells, strict=True))
+
+
+def _payload(point: Point) -> str:
+    assert point.against_float64 is not None
+    star = "★ " if point.pareto else ""
+    return f"{star}{_figure(point.bits_per_s) / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
+
+
+def _bus(point: Point) -> str:
+    """Bits a second on the bus, and its load; marks a split frame and a load above 1."""
+    load = _figure(point.can_load)
+    words = _share(load) + (", too much" if load > 1 else "")
+    return f"{_figure(point.can_bits_per_s) / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
+
+
+def _is_split(point: Point) -> bool:
+    return any(part is not None and part.can_frames > 1 for part in (point.measurement, point.command))
+
+
+def _share(ratio: float) -> str:
+    return f"{100 * ratio:.{0 if ratio > 0.0995 else 1}f}%"
+
+
+def _ms(interval: float | None, digits: str = ".1f") -> str:
+    return "–" if interval is None else f"{interval:{digits}}"
+
+
+def _notes(burden: Burden) -> Iterator[str]:
+    rate, bits = burden.rate_hz, burden.counter_bits
+    yield (
+        f"{burden.duration_s:g} s each; of two numbers the first is measurements, the second "
+        "commands; × and % are of float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
+    )
+    yield (
+        f"Every tick: {rate:g} + {rate:g} frames/s, {1e3 / rate:g} ms apart. On change: at least every "
+        f"{burden.heartbeat_s * 1e3:g} ms. CAN: a classic bus of 1 Mbit/s and its load, worst-case stuffing, without "
+        "heartbeats."
+    )
+    shorter = f"; {MIN_COUNTER_BITS} bits would carry {2 * MIN_COUNTER_BITS * rate / 1e3:g}"
+    yield (
+        f"The counter has {bits} bits: at every tick {rate:g} + {rate:g} frames/s carry {2 * bits * rate / 1e3:g} "
+        f"kbit/s of it{shorter if bits > MIN_COUNTER_BITS else ''}, padding apart."
+    )
+    if any(map(_is_split, burden.points)):
+        yield (
+            f"{_SPLIT} A frame of more than 8 bytes, reckoned as the classic frames that its bytes fill; in fact it "
+            "goes as one CAN FD frame."
+        )

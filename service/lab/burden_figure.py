@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from aeroloop.service.lab.burden import Burden, Point
-from aeroloop.service.lab.burden_table import short_name
+from aeroloop.service.lab.burden import Burden, Point, short_name
 from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style, save_as
 
 _STYLES: Final = {
@@ -113,8 +112,8 @@ def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
 
 def _legend(burden: Burden) -> list[Line2D]:
     """Entries of the legend; three columns, filled downwards."""
-    drawn = dict.fromkeys(point.quantizer for point in burden.points if point.quantizer is not None)
-    quantizers = [_key(_STYLES[kind][0], _STYLES[kind][1], short_name(kind)) for kind in drawn]
+    drawn = {short_name(point): _STYLES[point.quantizer] for point in burden.points if point.quantizer is not None}
+    quantizers = [_key(*style, name) for name, style in drawn.items()]
     color, marker = _STYLES[None]
     return [
         *quantizers,

@@ -21,7 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
-from aeroloop.service.lab.cells import Cell, Pool
+from aeroloop.service.lab.sweep import Sheets
+from aeroloop.service.lab.tables import Cell, run_cells
+from aeroloop.service.lab.workers import open_workers, run_of
 
 MEASURED_YAW_COULOMB: Final = 0.0037
 """Coulomb friction of the yaw axis as measured from spin-downs of another Aero [N·m]."""
@@ -52,48 +54,50 @@ class CalibrationError(AeroloopError):
     """Newton's method did not converge; one line."""
 
 
-def calibrate(settings: Settings, progress: Callable[[int], None] | None = None) -> Calibration:
+def calibrate(settings: Settings, progress: Callable[[int], None] = lambda _: None) -> Calibration:
     """Fit the plant, then the wind, from the configured values on. `progress` is called with the experiments done.
 
     Raises:
         CalibrationError: A cell is not reached within MAX_ROUNDS.
         PlantError: The plant is no emulated body.
+        ValueError: A cell trips.
     """
     settings.plant.mechanism()
     runs = 0
     published = paper.WIND["continuous"]
-    with Pool() as pool:
 
-        def evaluate(jobs: Sequence[tuple[Settings, Cell]]) -> np.ndarray:
-            nonlocal runs
-            results = pool.run(jobs, lambda done: progress(runs + done) if progress else None)
-            runs += len(jobs)
-            return np.array(results)
+    def body(p: Sequence[float]) -> list[str]:
+        return [f"plant.friction.coulomb=[{pitch}, {p[0]}]", f"plant.aero.centre_of_mass=[{x}, {y}, {p[1]}]"]
 
-        def fit(
-            build: Callable[[Sequence[float]], Settings], start: Sequence[float], steps: Sequence[float], air: str
-        ) -> tuple[np.ndarray, np.ndarray]:
-            target = np.array([published[air]["z_track_1e-4"], published[air]["u_total"]])
-            x = np.array(start)
-            for _ in range(MAX_ROUNDS):
-                probes = [x, *(x + step * axis for step, axis in zip(steps, np.eye(2), strict=True))]
-                cell = Cell(None, None, windy=air == "wind")
-                reached, *moved = evaluate([(build(probe.tolist()), cell) for probe in probes])
-                if np.all(np.abs(reached / target - 1) < TOLERANCE):
-                    return x, reached
-                jacobian = np.column_stack([(m - reached) / step for m, step in zip(moved, steps, strict=True)])
-                x = x - np.linalg.solve(jacobian, reached - target)
-            raise CalibrationError(f"the {air} cell is not reached after {MAX_ROUNDS} rounds, last at {reached}")
+    def fit(
+        build: Callable[[Sequence[float]], list[str]], start: Sequence[float], steps: Sequence[float], air: str
+    ) -> tuple[list[float], list[float]]:
+        nonlocal runs
+        target = np.array([published[air]["z_track_1e-4"], published[air]["u_total"]])
+        cell = Cell(None, None, windy=air == "wind")
+        p = np.array(start)
+        for _ in range(MAX_ROUNDS):
+            probes = [p, *(p + step * axis for step, axis in zip(steps, np.eye(2), strict=True))]
+            jobs = [run_of(settings, [*cell.overrides, *build(probe.tolist())]) for probe in probes]
+            reached, *moved = np.array(run_cells(workers, jobs))
+            progress(runs := runs + len(jobs))
+            if np.all(np.abs(reached / target - 1) < TOLERANCE):
+                return p.tolist(), reached.tolist()
+            jacobian = np.column_stack([(m - reached) / step for m, step in zip(moved, steps, strict=True)])
+            p = p - np.linalg.solve(jacobian, reached - target)
+        raise CalibrationError(f"the {air} cell is not reached after {MAX_ROUNDS} rounds, last at {reached}")
 
-        plant = settings.plant
-        start = plant.friction.coulomb[1], plant.aero.centre_of_mass[2]
-        x, calm = fit(lambda p: _with_body(settings, p), start, (1e-4, 2e-5), "calm")
-        body = _with_body(settings, x.tolist())
-        w, windy = fit(lambda p: _with_wind(body, p), plant.wind.torque[:2], (5e-4, 5e-4), "wind")
+    plant = settings.plant
+    (pitch, yaw), (x, y, z) = plant.friction.coulomb, plant.aero.centre_of_mass
+    with open_workers() as workers:
+        fitted, calm = fit(body, (yaw, z), (1e-4, 2e-5), "calm")
+        wind, windy = fit(
+            lambda p: [*body(fitted), f"plant.wind.torque={p}"], plant.wind.torque[:2], (5e-4,) * 2, "wind"
+        )
     return Calibration(
-        yaw_coulomb=x[0],
-        centre_of_mass_height=x[1],
-        wind_torque=(w[0], w[1]),
+        yaw_coulomb=fitted[0],
+        centre_of_mass_height=fitted[1],
+        wind_torque=(wind[0], wind[1]),
         calm={"z_track": calm[0], "u_total": calm[1]},
         windy={"z_track": windy[0], "u_total": windy[1]},
         residuals={
@@ -105,14 +109,16 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
     )
 
 
-def _with_body(settings: Settings, p: Sequence[float]) -> Settings:
-    plant = settings.plant
-    friction = plant.friction.model_copy(update={"coulomb": (plant.friction.coulomb[0], p[0])})
-    x, y, _ = plant.aero.centre_of_mass
-    aero = plant.aero.model_copy(update={"centre_of_mass": (x, y, p[1])})
-    return settings.model_copy(update={"plant": plant.model_copy(update={"friction": friction, "aero": aero})})
-
-
-def _with_wind(settings: Settings, p: Sequence[float]) -> Settings:
-    wind = settings.plant.wind.model_copy(update={"torque": tuple(p)})
-    return settings.model_copy(update={"plant": settings.plant.model_copy(update={"wind": wind})})
+def sheets(fit: Calibration) -> Sheets:
+    """The fitted values as text, beside independent measurements."""
+    pitch, yaw = fit.wind_torque
+    rows = (
+        ("plant.friction.coulomb, yaw", f"{fit.yaw_coulomb:.6f} N·m", f"{fit.yaw_coulomb_measured} N·m",
+         "measured from spin-downs of another Aero"),
+        ("plant.aero.centre_of_mass, z", f"{fit.centre_of_mass_height:.6f} m", f"{fit.centre_of_mass_height_paper} m",
+         "Table C.1, the value in the controller's model"),
+        ("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured"),
+    )  # fmt: skip
+    yield "", [dict(zip(("parameter", "fitted", "elsewhere", "what that is"), row, strict=True)) for row in rows]
+    yield "", [{"figure": name, "residual": f"{residual:+.2%}"} for name, residual in fit.residuals.items()]
+    yield f"{fit.runs} experiments", []

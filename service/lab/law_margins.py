@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import degrees, inf
-from typing import Any, Final
+from typing import Final
 
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.errors import AeroloopError
@@ -23,13 +23,18 @@ PUSHED_S: Final = 10.0
 """Length of a run with delay or lost frames [s]."""
 
 
-def survives(config: dict[str, Any], lost: bool, within_deg: float) -> int | None:
-    """The most ticks of delay, or frames lost in a row, with which the error stays within the bound; None if none is.
+def survived(settings: Settings, within_deg: float) -> dict[str, float | int | None]:
+    """The longest delay [ms], and the most frames lost in a row, with which the error stays within the bound.
 
-    It looks no further than a second.
+    None if none is. It looks no further than a second.
     """
-    settings = with_law_settings(Settings.model_validate(config))
+    settings = with_law_settings(settings)
+    delay, lost = _most(settings, within_deg, lost=False), _most(settings, within_deg, lost=True)
+    delay_ms = None if delay is None else round(delay * settings.loop.period * 1e3, 6)
+    return {"delay_ms": delay_ms, "lost_frames": lost}
 
+
+def _most(settings: Settings, within_deg: float, *, lost: bool) -> int | None:
     def fails(ticks: int) -> bool:
         late = {"lost": ticks, "delay": 0} if lost else {"lost": 0, "delay": ticks}
         return largest_error_deg(settings, **late) > within_deg

@@ -36,7 +36,7 @@ from aeroloop.service.lab.c_code import in_c
 
 BLOCK: Final = 512
 """Ticks of one call."""
-COMPILED_FROM: Final = 20_000
+COMPILED_FROM: Final = 30_000
 """Ticks of all runs from which on a function is compiled to C, which takes as long as some 40 000 ticks without."""
 _LOOPS: Final = 8
 _NEAR: Final = 1e-9

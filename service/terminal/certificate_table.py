@@ -1,16 +1,12 @@
-"""Terminal table of a certificate: verdict, bounds, assumptions, the terms that decide, or every term."""
+"""Certificate as text: verdict, bounds, assumptions, the terms that decide, or every term."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Container
+from collections.abc import Iterator
 from typing import Final
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
-from aeroloop.service.terminal.display import labelled
+from aeroloop.service.terminal.show import Row
 from aeroloop.service.theorem.any_law import OwnCertificate
 from aeroloop.service.theorem.certificate import Certificate
 
@@ -20,56 +16,38 @@ DECIDING: Final = (
 """Symbols of the terms that are shown unless --verbose: what goes in, what decides, what comes out."""
 
 
-def certificate_table(certificate: Certificate, *, verbose: bool = False) -> None:
-    """Print a certificate, with all of its terms if verbose."""
-    console = Console()
-    console.print(Text(certificate.verdict, style="bold green" if certificate.holds else "bold red"))
-    for reason in certificate.violated[1:]:
-        console.print(Text(f"  {reason}"))
-    console.print()
-    console.print(_bounds(certificate))
+def certificate_sheets(
+    certificate: Certificate | OwnCertificate, verbose: bool = False
+) -> Iterator[tuple[str, list[Row]]]:
+    """A certificate as tables and paragraphs, with all of its terms if verbose; of a user's law, what it says."""
+    if isinstance(certificate, OwnCertificate):
+        said = certificate.model_extra or {}
+        yield certificate.verdict, [{"": name, "value": str(value)} for name, value in said.items()]
+        return
+    yield "\n  ".join([certificate.verdict, *certificate.violated[1:]]), []
+    yield "", list(_bounds(certificate))
     if certificate.delay_ms is not None:
         late = f"{certificate.delay_ms:.1f} ms of further delay, or {certificate.lost_frames} frames lost in a row"
-        console.print(Text(f"\nIt still holds with {late}."))
-    console.print(Text("\nAssumed:"))
-    for assumption in certificate.assumptions:
-        console.print(Text(f"  {assumption}"))
-    console.print()
-    console.print(_terms(certificate, None if verbose else DECIDING))
+        yield f"It still holds with {late}.", []
+    yield "\n  ".join(["Assumed:", *certificate.assumptions]), []
+    yield "", list(_terms(certificate, verbose))
     if not verbose:
-        console.print(Text(f"\n--verbose prints all {len(certificate.terms)} terms, with their equations."))
+        yield f"--verbose prints all {len(certificate.terms)} terms, with their equations.", []
 
 
-def own_certificate(certificate: OwnCertificate) -> None:
-    """Print what a user's law says is proven."""
-    console, table = Console(), labelled()
-    console.print(Text(certificate.verdict, style="bold green" if certificate.holds else "bold red"))
-    for name, value in (certificate.model_extra or {}).items():
-        table.add_row(name, Text(str(value)))
-    if table.row_count:
-        console.print(table)
-
-
-def _bounds(certificate: Certificate) -> Table:
-    table = Table("proven, in the end", "‖z‖", "attitude", box=None, pad_edge=False)
+def _bounds(certificate: Certificate) -> Iterator[Row]:
     for what, radius, angle in (
         ("paper's body, root of the mean square", certificate.rms_radius, None),
         ("paper's body, at every instant", certificate.pointwise_radius, certificate.pointwise_deg),
         ("configured plant, at every instant", certificate.plant_radius, certificate.plant_deg),
     ):
         shown = "not proven" if radius is None else f"{radius:.4g}"
-        table.add_row(what, shown, "" if angle is None else f"{angle:.2f}°")
-    return table
+        yield {"proven, in the end": what, "‖z‖": shown, "attitude": "" if angle is None else f"{angle:.2f}°"}
 
 
-def _terms(certificate: Certificate, symbols: Container[str] | None) -> Table:
-    table = Table("symbol", "value", "unit", "meaning", box=None, pad_edge=False)
-    table.columns[1].justify = "right"
-    for column in table.columns[:3]:
-        column.no_wrap = True
+def _terms(certificate: Certificate, verbose: bool) -> Iterator[Row]:
     for term in certificate.terms:
-        if symbols is None or term.symbol in symbols:
+        if verbose or term.symbol in DECIDING:
             value = "–" if term.value is None else f"{term.value:.4g}"
-            meaning = f"{term.meaning} ({term.equation})" if symbols is None else re.split("[;,]", term.meaning)[0]
-            table.add_row(*(Text(cell) for cell in (term.symbol, value, term.unit, meaning)))
-    return table
+            meaning = f"{term.meaning} ({term.equation})" if verbose else re.split("[;,]", term.meaning)[0]
+            yield {"symbol": term.symbol, "value": value, "unit": term.unit, "meaning": meaning}

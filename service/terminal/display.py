@@ -5,7 +5,7 @@ Tables go to stdout, bars to stderr. A bar is drawn only on a terminal and erase
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from math import degrees
@@ -20,6 +20,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -28,13 +29,10 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.service.figures import Figures
-from aeroloop.service.lab import paper
 
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
-    from aeroloop.service.lab.calibrate import Calibration
     from aeroloop.service.lab.demo import Progress as DemoProgress
-    from aeroloop.service.lab.tables import Tables
 
 LABELS: Final = 22
 """Width of the column of labels."""
@@ -75,6 +73,13 @@ def labelled() -> Table:
     return Table(labels, texts, show_header=False, box=None, pad_edge=False)
 
 
+class _Rate(ProgressColumn):
+    """How many are done a second, lately."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+
 @contextmanager
 def _bar(title: str, total: float | None, hidden: bool, *columns: ProgressColumn) -> Iterator[Callable[..., None]]:
     shown = not hidden and _stderr.is_terminal
@@ -94,7 +99,8 @@ def progress_bar(title: str, total_s: float, *, hidden: bool = False) -> Iterato
 @contextmanager
 def count_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[int, int | None], None]]:
     """A bar updated with the number done and the number in all, None where it is open."""
-    with _bar(title, None, hidden, MofNCompleteColumn(), TimeElapsedColumn()) as update:
+    columns = MofNCompleteColumn(), _Rate(), TimeElapsedColumn(), TimeRemainingColumn()
+    with _bar(title, None, hidden, *columns) as update:
         yield lambda done, total: update(completed=done, total=total)
 
 
@@ -103,72 +109,6 @@ def share_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[float],
     """A bar updated with the share done, 0…1."""
     with _bar(title, 1.0, hidden, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as update:
         yield lambda share: update(completed=share)
-
-
-def paper_tables(tables: Tables) -> None:
-    """Print the predicted tables beside the published ones."""
-    from aeroloop.service.lab.tables import ERRORS, NOT_IDENTIFIED, comparison  # it imports the closed loop
-
-    console = Console()
-    for title, table, digits in (
-        ("z_track [1e-4 s], Table C.2", tables.C2, 1),
-        ("u_total [V²·s], Table C.3", tables.C3, 0),
-    ):
-        grid = Table("in ╲ out", title=f"{title}: ours (paper's)", title_justify="left", box=None)
-        for out in paper.OUTPUT_BITS:
-            grid.add_column("cont" if out is None else f"{out} bits", justify="right")
-        for i, inp in enumerate(paper.INPUT_BITS):
-            spread = table.spread[i] if table.spread else [None] * len(paper.OUTPUT_BITS)
-            cells = zip(table.ours[i], table.paper[i], spread, strict=True)
-            grid.add_row("cont" if inp is None else f"{inp} bits", *(_beside(*cell, digits) for cell in cells))
-        console.print(grid)
-        console.print()
-    grid = Table("", title="with and without wind, Table C.4: ours (paper's)", title_justify="left", box=None)
-    for air in ("calm", "wind"):
-        grid.add_column(f"z_track, {air}", justify="right")
-        grid.add_column(f"u_total, {air}", justify="right")
-    for case, ours in tables.C4.ours.items():
-        theirs, spreads = tables.C4.paper[case], tables.C4.spread[case] if tables.C4.spread else None
-        shown = [
-            _beside(ours[air][name], theirs[air][name], spreads and spreads[air][name], digits)
-            for air in ("calm", "wind")
-            for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
-        ]
-        grid.add_row(case, *shown)
-    console.print(grid)
-    rows_table(comparison(tables), f"\n{ERRORS}")
-    console.print(f"\n{NOT_IDENTIFIED}")
-
-
-def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
-    plus_minus = "" if spread is None else f" ±{spread:.{digits}f}"
-    return f"{mine:.{digits}f}{plus_minus} ({theirs})"
-
-
-def rows_table(rows: Sequence[Sequence[str]], title: str | None = None) -> None:
-    """Print rows of text, a header first; all columns but the first hold numbers."""
-    header, *rest = rows
-    table = Table(header[0], title=title, title_justify="left", box=None)
-    for column in header[1:]:
-        table.add_column(column, justify="right")
-    for row in rest:
-        table.add_row(*row)
-    Console().print(table)
-
-
-def calibration_table(fit: Calibration) -> None:
-    """Print the fitted values beside independent measurements."""
-    table = Table("parameter", "fitted", "elsewhere", "what that is", box=None)
-    fitted, measured = f"{fit.yaw_coulomb:.6f} N·m", f"{fit.yaw_coulomb_measured} N·m"
-    table.add_row("plant.friction.coulomb, yaw", fitted, measured, "measured from spin-downs of another Aero")
-    fitted, published = f"{fit.centre_of_mass_height:.6f} m", f"{fit.centre_of_mass_height_paper} m"
-    table.add_row("plant.aero.centre_of_mass, z", fitted, published, "Table C.1, the value in the controller's model")
-    pitch, yaw = fit.wind_torque
-    table.add_row("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured")
-    Console().print(table)
-    for name, residual in fit.residuals.items():
-        Console().print(f"residual {name}: {residual:+.2%}")
-    Console().print(f"{fit.runs} experiments")
 
 
 @contextmanager

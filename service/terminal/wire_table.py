@@ -1,44 +1,36 @@
-"""Terminal table of a wire spec, for `show spec`."""
+"""Wire spec as text: each signal's quantizer, each frame's size, for `show spec`."""
 
 from __future__ import annotations
 
-from functools import partial
-
-from rich.console import Console
-from rich.table import Column, Table
+from collections.abc import Iterator
 
 from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.terminal.show import Row
 
 
-def wire_table(wire: WireSpec) -> None:
-    """Print a wire spec: each signal's quantizer, each frame's size."""
-    console = Console()
-    fold, gap = partial(Column, overflow="fold"), 2 if console.width >= 80 else 1
-    columns = (
-        Column("signal", no_wrap=True),
-        fold("kind"),
-        "bits",
-        "limit",
-        fold("step"),
-        fold("largest\nerror"),
-        "unit",
-    )
-    table = Table(*columns, box=None, padding=(0, gap, 0, 0))
-    signals = (("ε attitude", wire.attitude, ""), ("ω rate", wire.rate, "rad/s"), ("u voltage", wire.voltage, "V"))
-    notes = list[str]()
-    for name, signal, unit in signals:
+def wire_sheets(wire: WireSpec) -> Iterator[tuple[str, list[Row]]]:
+    """A wire spec as a table and paragraphs."""
+    rows, notes = list[Row](), list[str]()
+    for name, signal, unit in (
+        ("ε attitude", wire.attitude, ""),
+        ("ω rate", wire.rate, "rad/s"),
+        ("u voltage", wire.voltage, "V"),
+    ):
         quantizer = signal.quantizer()
         step, note = _steps(quantizer, f" {unit}".rstrip())
         if note is not None:
             notes.append(f"{name}: {note}")
         kind, bits = ("–", "cont") if signal.bits is None else (signal.kind, str(signal.bits))
-        table.add_row(name, kind, bits, f"±{signal.limit:g}", step, f"{quantizer.bound:.6g}", unit or "1")
-    console.print(table)
-    for note in notes:
-        console.print(note, highlight=False)
+        limit, error = f"±{signal.limit:g}", f"{quantizer.bound:.6g}"
+        rows.append(
+            {"signal": name, "kind": kind, "bits": bits, "limit": limit, "step": step, "largest error": error}
+            | {"unit": unit or "1"}
+        )
+    yield "", rows
     for label, frame in (("measurement", wire.measurement), ("command", wire.command)):
-        console.print(f"{label}: {frame.bits} bits in {frame.size} bytes, {frame.counter_bits} of them the counter")
+        notes.append(f"{label}: {frame.bits} bits in {frame.size} bytes, {frame.counter_bits} of them the counter")
+    yield "\n".join(notes), []
 
 
 def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:

@@ -13,15 +13,22 @@ import time
 
 from distributed import LocalCluster
 
-from aeroloop.service.lab.workers import Workers
+from aeroloop.service.config import Settings
+from aeroloop.service.lab.workers import open_workers, run_of
+
+
+def nothing(_settings: Settings) -> None:
+    """Do nothing."""
 
 
 def measure(engine: str, jobs: int) -> None:
     """Print the costs of an engine."""
-    with Workers(engine) as workers:
-        workers.each(divmod, [(1, 1)] * 10)  # the workers have started
-        began, cpu = time.monotonic(), time.process_time()
-        workers.each(divmod, [(1, 1)] * jobs)
+    runs = [run_of(Settings())]
+    with open_workers(engine) as workers:
+        workers.rows(nothing, runs * 10)  # the workers have started
+        began, cpu, before = time.monotonic(), time.process_time(), len(workers.batches)
+        while len(workers.batches) < before + jobs:
+            workers.rows(nothing, runs * 8)  # too few for batches of several
         cpu, took = time.process_time() - cpu, time.monotonic() - began
     print(f"{engine.partition(':')[0]}: {cpu / jobs * 1e3:.2f} ms of CPU here, {took / jobs * 1e3:.2f} ms a job")
 
@@ -29,7 +36,7 @@ def measure(engine: str, jobs: int) -> None:
 def main(jobs: int = 2000) -> None:
     """Measure both engines with as many workers as two cores."""
     measure("processes", jobs)
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
         measure(f"dask:{cluster.scheduler_address}", jobs)
 
 

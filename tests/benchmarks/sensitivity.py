@@ -10,8 +10,8 @@ import numpy as np
 
 from aeroloop.service.config import load
 from aeroloop.service.lab import paper
-from aeroloop.service.lab.cells import Cell, Pool
-from aeroloop.service.lab.tables import CASES
+from aeroloop.service.lab.tables import CASES, Cell, run_cells
+from aeroloop.service.lab.workers import open_workers, run_of
 
 PLANT = load().plant
 PITCH, YAW = PLANT.friction.coulomb
@@ -42,9 +42,10 @@ def main() -> None:
     probes = [[f"plant.{key}" for key in KEYS.format(*p, p=PITCH).split("|")] for p in steps]
     row = [Cell(out, 7) for out in paper.OUTPUT_BITS] + [Cell(8, 6, windy=True)]
     corners = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
-    with Pool() as pool:
-        tables = np.array(pool.run([(load(overrides=o), cell) for o in CHANGES.values() for cell in row]))
-        fits = np.array(pool.run([(load(overrides=o), cell) for o in probes for cell in corners]))
+    with open_workers() as workers:
+        changed = [run_of(load(overrides=o), cell.overrides) for o in CHANGES.values() for cell in row]
+        fitted = [run_of(load(overrides=o), cell.overrides) for o in probes for cell in corners]
+        tables, fits = np.array(run_cells(workers, changed)), np.array(run_cells(workers, fitted))
     fits = fits.reshape(len(probes), len(corners), 2)
     for name, (*calm, windy) in zip(CHANGES, tables.reshape(-1, len(row), 2), strict=True):
         published = np.array([paper.Z_TRACK, paper.U_TOTAL])  # the last of each is fitted

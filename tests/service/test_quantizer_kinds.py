@@ -12,8 +12,9 @@ import pytest
 from aeroloop.protocol.wire.spec import Kind
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import ConfigError, Settings, load, load_over, with_bits
-from aeroloop.service.lab.cells import Cell, run_cell
-from aeroloop.service.lab.experiment import experiment, run_experiment
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.tables import Cell
+from aeroloop.service.lab.workers import run_of
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import SessionReplay, replay
@@ -71,16 +72,8 @@ def test_more_bits_bring_every_kind_to_the_loop_without_quantization(kind: str) 
 
 
 @other_kinds
-def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = list[Settings]()
-
-    def instead(settings: Settings, duration_s: float) -> object:
-        seen.append(settings)
-        return experiment(settings, duration_s / 500)
-
-    monkeypatch.setattr("aeroloop.service.lab.cells.experiment", instead)
-    run_cell(throughout(kind).description(), Cell(bits_out=9, bits_in=7))
-    wire = seen[0].wire
+def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str) -> None:
+    wire = run_of(throughout(kind), Cell(bits_out=9, bits_in=7).overrides).settings().wire
     assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [
         (kind, 9), (kind, 9), (kind, 7)
     ]  # fmt: skip

@@ -1,28 +1,47 @@
-"""Grid of `lab burden`: cells, Pareto front, command."""
+"""Grid of `lab burden`: cells, Pareto front, traffic of one direction, frames on a CAN bus, command."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import json
-from io import StringIO
+from math import nan
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
-from rich.console import Console
 
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.transmit import Sender
 from aeroloop.service.cli.main import execute
-from aeroloop.service.config import load
-from aeroloop.service.lab import burden_table
-from aeroloop.service.lab.burden import Burden, measure_burden, pareto_front
+from aeroloop.service.config import Settings, load
+from aeroloop.service.lab.burden import (
+    BITS,
+    POLICIES,
+    QUANTIZERS,
+    SENSORS,
+    Burden,
+    BurdenError,
+    Traffic,
+    bus_bits,
+    cell_settings,
+    classic_frame_bits,
+    classic_frames,
+    codes_of,
+    grid,
+    measure_burden,
+    observe,
+    pareto_front,
+    sheets,
+    traffic,
+)
 from aeroloop.service.lab.burden_figure import draw_burden
-from aeroloop.service.lab.burden_grid import BITS, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
-from aeroloop.service.lab.burden_table import HEADER, markdown
+from aeroloop.service.lab.experiment import run_experiment, sent_ticks
 from aeroloop.service.logs.outputs import OutputError
-from tests.support.in_this_process import InThisProcess
+from tests.support.in_this_process import run_here
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -109,7 +128,7 @@ def test_what_there_is_not_is_refused_in_one_line_before_anything_runs(
 
 
 def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aeroloop.service.lab.burden.Workers", InThisProcess)
+    run_here(monkeypatch)
     still = load(overrides=["reference.kind=hold"])
     with pytest.raises(BurdenError, match=r"^float64 makes no error, sensors perfect"):
         measure_burden(still, grid(still, ["cont"], sensors=["perfect"]), 0.1)
@@ -121,7 +140,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     figure = tmp_path_factory.mktemp("burden") / "burden.png"
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), pytest.MonkeyPatch.context() as patched:
-        patched.setattr("aeroloop.service.lab.burden.Workers", InThisProcess)
+        run_here(patched)
         arguments = ["--bits", "8/6", "--bits", "2/2", "--quantizer", "uniform", "--sensors", "encoders"]
         assert execute(["lab", "burden", *arguments, "--duration", "4", "--figure", str(figure), "--json"]) == 0
     return printed.getvalue(), figure
@@ -167,30 +186,19 @@ def test_the_figure_is_an_image(document: tuple[str, Path], tmp_path: Path) -> N
         draw_burden(burden, tmp_path / "none" / "burden.svg")
 
 
-def test_the_markdown_is_a_table_with_a_row_for_each_experiment(document: tuple[str, Path]) -> None:
-    lines = markdown(Burden.model_validate_json(document[0])).splitlines()
-    rows = [line for line in lines if line.startswith("|")]
-    assert len(rows) == 2 + 3
-    assert {line.count("|") for line in rows} == {len(HEADER) + 1}
-    assert "★" in rows[2]
-    assert any("voltage limit" in line for line in lines)
-
-
-def test_at_80_columns_every_figure_stands_whole_in_a_block_for_each_policy(
-    document: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    screen = Console(width=80, force_terminal=True, color_system=None, file=StringIO())
-    monkeypatch.setattr(burden_table, "Console", lambda: screen)
-    burden = Burden.model_validate_json(document[0])
-    burden_table.burden_table(burden)
-    assert isinstance(screen.file, StringIO)
-    lines = screen.file.getvalue().splitlines()
-    assert max(map(len, lines)) <= 80
-    rows = [line.strip("| ").split(" | ") for line in markdown(burden).splitlines() if line.startswith("| ")][1:]
-    blocks = "\n".join(lines).partition("every tick\n")[2].partition("on change\n")
-    for shown, columns in ((blocks[0], (0, 1, 2, 3, 5, 6)), (blocks[2], (0, 1, 7, 8, 10, 11))):
-        for row in rows:
-            assert any(line.split() == " ".join(row[i] for i in columns).split() for line in shown.splitlines()), row
+def test_there_is_a_row_for_each_experiment_and_a_reason_for_each_without_figures(document: tuple[str, Path]) -> None:
+    (title, rows), (reason, _), *notes = sheets(Burden.model_validate_json(document[0]))
+    assert title.startswith("sensors encoders: ")
+    assert [(row["bits out/in"], row["quantizer"]) for row in rows] == [
+        ("8/6", "uniform"),
+        ("2/2", "uniform"),
+        ("cont/cont", "float64"),
+    ]
+    assert rows[0]["on change: kbit/s"].startswith("★ ")
+    assert set(list(rows[1].values())[2:]) == {"–"}
+    assert reason.startswith("2/2 uniform: ")
+    assert "voltage limit" in reason
+    assert not any(rows for _, rows in notes)
 
 
 def test_the_table_states_what_the_counter_costs(document: tuple[str, Path]) -> None:
@@ -200,5 +208,155 @@ def test_the_table_states_what_the_counter_costs(document: tuple[str, Path]) -> 
         (10, "500 + 500 frames/s carry 10 kbit/s of it; 4 bits would carry 4, padding apart."),
         (4, "500 + 500 frames/s carry 4 kbit/s of it, padding apart."),
     ):
-        text = markdown(burden.model_copy(update={"counter_bits": bits}))
-        assert f"The counter has {bits} bits: at every tick {line}" in text
+        notes = [note for note, _ in sheets(burden.model_copy(update={"counter_bits": bits}))]
+        assert f"The counter has {bits} bits: at every tick {line}" in notes
+
+
+# ── traffic ──
+
+NO_FRAME = b""
+KIND = FrameFormat([6, 6], 4)
+CODES = np.array([(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)], float)
+PERIOD = 0.01
+
+
+def test_every_tick_is_sent_when_periodic() -> None:
+    assert sent_ticks(CODES, "periodic", 4).tolist() == list(range(10))
+
+
+def test_on_change_sends_what_is_new_and_a_heartbeat_after_so_many_ticks() -> None:
+    assert sent_ticks(CODES, "on_change", 4).tolist() == [0, 2, 3, 7]
+    assert sent_ticks(CODES, "on_change", 7).tolist() == [0, 2, 3]
+
+
+def test_rates_are_over_all_ticks_and_intervals_between_frames_sent() -> None:
+    seen = traffic(CODES, KIND, np.array([0, 2, 3, 7]), PERIOD)
+    assert seen.frames_per_s == pytest.approx(40)
+    assert seen.bits_per_s == pytest.approx(40 * 16)
+    assert seen.component_changes_per_s == pytest.approx([10, 20])  # 0→2, and 0→1→0
+    assert seen.changes_per_s == pytest.approx(30)
+    assert seen.mean_interval_ms == pytest.approx(70 / 3)
+    assert seen.least_interval_ms == pytest.approx(10)
+    assert seen.can_frames == 1
+    assert seen.can_bits_per_s == pytest.approx(40 * 75)
+    assert seen.can_load == pytest.approx(0.003)
+
+
+def test_changes_do_not_depend_on_what_was_sent() -> None:
+    always, changed = traffic(CODES, KIND, np.arange(10), PERIOD), traffic(CODES, KIND, np.array([0]), PERIOD)
+    assert always.changes_per_s == changed.changes_per_s > 0
+    assert changed.mean_interval_ms is None
+    assert changed.least_interval_ms is None
+
+
+def test_a_frame_longer_than_a_classic_one_counts_as_several() -> None:
+    floats = FrameFormat([None, None], 4)
+    seen = traffic(np.array([(0.0, 1.0)] * 4), floats, np.arange(4), PERIOD)
+    assert floats.size == 17
+    assert seen.can_frames == 3
+    assert seen.can_bits_per_s == pytest.approx(100 * (135 + 135 + 65))
+
+
+def test_nothing_and_nonsense_are_refused() -> None:
+    with pytest.raises(ValueError, match="ticks"):
+        traffic(np.empty((0, 2)), KIND, np.arange(0), PERIOD)
+    with pytest.raises(ValueError, match="malformed"):
+        codes_of([KIND.pack(0, (1, 2)), NO_FRAME], KIND)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("wire.attitude.kind=hysteresis-uniform", "wire.voltage.kind=logarithmic-uniform"),
+        ('wire.rate.bits="cont"', "wire.transmit.heartbeat_s=0.01"),
+    ],
+    ids=["uniform", "other quantizers", "float64 rates"],
+)
+def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides: tuple[str, ...]) -> None:
+    """The last bit included: frames, their ticks, figures."""
+    settings = load(overrides=overrides)
+    said: list[tuple[bytes, bytes]] = []
+    run_experiment(settings, 3.0, watch=lambda _k, *frames: said.append(frames))
+    received: list[tuple[bytes, bytes]] = []
+    figures = run_experiment(_on_change(settings), 3.0, watch=lambda _k, *frames: received.append(frames))
+
+    seen = [dict(row) for row in observe(settings, 3.0)]
+    assert [row["transmit"] for row in seen] == list(POLICIES)
+    for row in seen:
+        assert (row["z_track"], row["u_total"]) == (figures.z_track, figures.u_total)
+    wire = settings.wire
+    counters = wire.measurement.counters
+    heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
+    for i, (kind, measured) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
+        sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat).tolist()
+        assert [k for k, frames in enumerate(received) if frames[i] != NO_FRAME] == sent
+        assert [received[k][i] for k in sent] == [said[k][i] for k in sent]
+        reckoned = seen[-1][("measurement", "command")[i]]
+        assert isinstance(reckoned, Traffic)
+        assert (reckoned.frames_per_s, reckoned.bits_per_s) == (measured.frames_per_s, measured.bits_per_s)
+        assert 0 < len(sent) < len(said)
+
+
+def _on_change(settings: Settings) -> Settings:
+    transmit = settings.wire.transmit.model_copy(update={"measurement": "on_change", "command": "on_change"})
+    return settings.model_copy(update={"wire": settings.wire.model_copy(update={"transmit": transmit})})
+
+
+@given(
+    st.lists(st.sampled_from([(0.0, 1.0), (-0.0, 1.0), (nan, 1.0), (2.0, 1.0)]), min_size=1, max_size=40),
+    st.integers(1, 7),
+)
+def test_ticks_sent_are_those_of_a_sender(codes: list[tuple[float, float]], heartbeat: int) -> None:
+    sender = Sender("on_change", heartbeat, 16)
+    sent = [k for k, each in enumerate(codes) if sender.due(k, each)]
+    assert sent_ticks(np.array(codes), "on_change", heartbeat).tolist() == sent
+
+
+# ── frames on a classic CAN bus ──
+
+
+def stuffed_length(identifier: int, data: bytes) -> int:
+    """Bits on the bus of a classic data frame, from the start of frame to the end of the interframe space."""
+    head = f"0{identifier:011b}000{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
+    crc = 0
+    for bit in head:
+        crc = (crc << 1) ^ (0x4599 if int(bit) ^ (crc >> 14) else 0)
+        crc &= 0x7FFF
+    stuffed, run, last = 0, 0, ""
+    for bit in f"{head}{crc:015b}":
+        run = run + 1 if bit == last else 1
+        stuffed, last = stuffed + 1, bit
+        if run == 5:
+            stuffed, run, last = stuffed + 1, 1, "1" if bit == "0" else "0"
+    return stuffed + 1 + 2 + 7 + 3  # CRC delimiter, acknowledgement, end of frame, interframe space
+
+
+def test_classic_frames_take_the_bits_that_the_literature_has() -> None:
+    # Davis, Burns, Bril and Lukkien, Controller Area Network schedulability analysis, 2007: 55 + 10 s bits.
+    assert [classic_frame_bits(n) for n in range(9)] == [55, 65, 75, 85, 95, 105, 115, 125, 135]
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+def test_no_frame_takes_more_than_the_worst(identifier: int, data: bytes) -> None:
+    assert 47 + 8 * len(data) <= stuffed_length(identifier, data) <= classic_frame_bits(len(data))
+
+
+@pytest.mark.parametrize("size", range(1, 9))
+def test_the_worst_is_nearly_reached(size: int) -> None:
+    """Runs of four equal bits after a stuffed one: only the header and the CRC are not as bad as that."""
+    worst = max(stuffed_length(0x078, bytes([byte]) * size) for byte in range(256))
+    assert worst >= classic_frame_bits(size) - 7
+
+
+def test_what_does_not_fit_one_classic_frame_is_split_over_several() -> None:
+    assert classic_frames(7) == [7]
+    assert classic_frames(8) == [8]
+    assert classic_frames(10) == [8, 2]
+    assert classic_frames(49) == [8, 8, 8, 8, 8, 8, 1]
+    assert bus_bits(7) == 125
+    assert bus_bits(10) == 135 + 75
+    assert bus_bits(49) == 6 * 135 + 65
+    for size in (-1, 9):
+        with pytest.raises(ValueError, match="8 bytes"):
+            classic_frame_bits(size)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,7 +17,7 @@ from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.figures import Figures, Floats
-from aeroloop.service.lab import c_code, experiment, loop_function
+from aeroloop.service.lab import experiment, loop_function
 from aeroloop.service.lab.experiment import LoopEndedError, run_experiment, sent_ticks
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
 
@@ -140,25 +139,24 @@ VARIED = (
 
 @needs_a_compiler
 @pytest.mark.parametrize("overrides", VARIED)
-def test_c_gives_the_same_bits_and_is_compiled_once(
-    overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_c_gives_the_same_bits_and_leaves_no_file(
+    overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(loop_function, "COMPILED_FROM", 1)
     settings = load(overrides=overrides)
-    for _ in range(2):  # the second finds the first one's library
-        loop = Loop(settings)
-        assert_the_same(settings, loop)
-        assert loop.in_c
-        (library,) = (tmp_path / "aeroloop").glob("*.so")
-        assert list((tmp_path / "aeroloop").iterdir()) == [library]  # and nothing half-written beside it
+    loop = Loop(settings)
+    assert_the_same(settings, loop)
+    assert loop.in_c
+    del loop
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("compiler", [None, "#!/bin/sh\nexit 1\n", "#!/bin/sh\nexit 0\n"])
 def test_without_a_compiler_or_with_a_broken_one_the_virtual_machine_runs_it(
     compiler: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(loop_function, "COMPILED_FROM", 1)
     if compiler is not None:
@@ -167,49 +165,6 @@ def test_without_a_compiler_or_with_a_broken_one_the_virtual_machine_runs_it(
     loop = Loop(load())
     assert_the_same(load(), loop)
     assert not loop.in_c
-
-
-@needs_a_compiler
-def test_only_the_newest_libraries_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (tmp_path / "aeroloop").mkdir()
-    for i in range(c_code.KEPT + 3):
-        (tmp_path / "aeroloop" / f"{i}.so").touch()
-        os.utime(tmp_path / "aeroloop" / f"{i}.so", (i, i))
-    assert c_code.in_c(loop_of(load()).tick) is not None
-    left = {path.stem for path in (tmp_path / "aeroloop").iterdir()}
-    assert len(left) == c_code.KEPT
-    assert not left & {"0", "1", "2", "3"}
-
-
-@needs_a_compiler
-def test_a_library_that_is_cut_off_or_damaged_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One cut off ends the process that loads it; a flipped bit may give other figures."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
-    library = c_code.shared_object_of(source)
-    assert library is not None
-    whole = library.read_bytes()
-    flipped = bytes([*whole[:4000], whole[4000] ^ 1, *whole[4001:]])
-    for damaged in (b"", b"hello", whole[:1000], whole[: len(whole) // 2], whole[:-1], flipped, bytes(len(whole))):
-        library.unlink()  # it is loaded
-        library.write_bytes(damaged)
-        assert c_code.shared_object_of(source) == library
-        assert ca.external("twice", str(library))(21) == 42
-        assert len(library.read_bytes()) == len(whole)
-
-
-@needs_a_compiler
-def test_no_other_process_sees_a_library_that_is_not_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All workers of a first run compile the same at once."""
-    cache, seen, compiler = tmp_path / "aeroloop", tmp_path / "seen", shutil.which("cc") or shutil.which("gcc")
-    (tmp_path / "cc").write_text(f'#!/bin/sh\n{compiler} "$@"\nls {cache} | grep [.]so >> {seen}\ntrue\n')
-    (tmp_path / "cc").chmod(0o755)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
-    assert c_code.shared_object_of(source) is not None
-    assert seen.read_text() == ""
 
 
 def test_one_function_serves_all_cells_that_differ_in_bits_seeds_and_wind() -> None:

@@ -5,24 +5,34 @@ from __future__ import annotations
 import json
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from math import exp, log
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over, with_law_settings
-from aeroloop.service.lab import law_margins, loop_function, tune, tune_costs, tune_runs, tune_search, workers
+from aeroloop.service.lab import law_margins, loop_function, tune
 from aeroloop.service.lab.loop_function import Loop
-from aeroloop.service.lab.tune import Tuning
-from aeroloop.service.lab.tune_costs import Limits, rank
-from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, run_case, with_case
-from aeroloop.service.lab.tune_search import Plan, Search, TuneError
-from aeroloop.service.terminal import tune_table
+from aeroloop.service.lab.sweep import Progress
+from aeroloop.service.lab.tune import (
+    Case,
+    Limits,
+    Ran,
+    Search,
+    TuneError,
+    TuneOptions,
+    Tuning,
+    rank,
+    run_case,
+    sheets,
+    with_case,
+)
+from aeroloop.service.terminal.show import show_all
 from tests.support.failing_laws import FAILING
-from tests.support.in_this_process import InThisProcess
+from tests.support.in_this_process import run_here, workers_here
 from tests.support.own_laws import HERE
 
 SLOW = load(overrides=["loop.rate_hz=100"])
@@ -54,23 +64,40 @@ def modelled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, list[Case]]]:
     """Runs that are formulas of the first gain, of x; what was asked of them, in order."""
     asked = list[tuple[float, list[Case]]]()
 
-    def runs(_config: str, law: LawValues, cases: Sequence[Case], _duration_s: float) -> list[Ran]:
-        gain = law["C1"][0] if "C1" in law else law["offset"]
+    def runs(settings: Settings, cases: Sequence[Case], duration_s: float) -> list[Ran]:
+        gain = first_gain(settings)
         asked.append((gain, list(cases)))
+        assert duration_s > 0
         return [optimum(gain) for _ in cases]
 
-    for module in (tune, tune_search):
-        monkeypatch.setattr(module, "run_cases", runs)
-    monkeypatch.setattr(tune, "survives", lambda *_: 7)
+    survives(monkeypatch, {"delay_ms": 70.0, "lost_frames": 7})
+    monkeypatch.setattr(tune, "run_cases", runs)
     return asked
 
 
-def found(settings: Settings, plan: Plan, doing: InThisProcess | None = None) -> Tuning:
-    with doing or InThisProcess() as its:
-        return tune.tune(settings, plan, its)
+def first_gain(settings: Settings) -> float:
+    law = settings.law.model_dump()
+    gain = law["C1"][0] if "C1" in law else law["offset"]
+    assert isinstance(gain, float)
+    return gain
 
 
-FEW = Plan(seeds=1, winds=(0.0,), held_out=1, budget=200, duration_s=0.2)
+def survives(monkeypatch: pytest.MonkeyPatch, found: dict[str, float | int | None]) -> None:
+    def survived(_settings: Settings, within_deg: float) -> dict[str, float | int | None]:
+        assert within_deg > 0
+        return found
+
+    monkeypatch.setattr(tune, "survived", survived)
+
+
+NOTHING: dict[str, float | int | None] = {"delay_ms": None, "lost_frames": None}
+
+
+def found(settings: Settings, options: TuneOptions, progress: Progress = lambda *_: None, count: int = 1) -> Tuning:
+    return tune.tune(settings, options, workers_here(count), progress)
+
+
+FEW = TuneOptions(seeds=1, winds=(0.0,), held_out=1, budget=200, duration_s=0.2)
 MASS = FEW._replace(names=["mass"])
 
 
@@ -97,7 +124,7 @@ def test_a_search_ends_at_the_bounds_of_the_settings_and_at_the_limits_of_its_co
     assert limited.training.changes_per_s is not None
     assert limited.training.changes_per_s <= 250
     assert limited.training.changes_per_s == limited.held_out.changes_per_s
-    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune_costs.MORE
+    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune.MORE
 
 
 def test_what_trips_or_exceeds_a_limit_ranks_behind_anything_that_does_not() -> None:
@@ -137,33 +164,20 @@ def test_a_case_is_a_seed_and_a_wind_of_the_plant() -> None:
     assert with_case(SLOW, Case(seed=3, wind=0.5)).plant.sensors.seed == 3
 
 
-class Backwards(InThisProcess):
-    """Ends its jobs in another order."""
-
-    def stream(self, work: Callable[..., Any], jobs: Iterable[Any]) -> Iterator[tuple[int, Any]]:
-        yield from reversed(list(super().stream(work, jobs)))
-
-
 def test_the_same_seed_finds_the_same_in_whatever_order_runs_end(modelled: list[tuple[float, list[Case]]]) -> None:
     plan = FEW._replace(budget=100, max_chatter=1e9)
-    first, again = found(SLOW, plan), found(SLOW, plan, Backwards())
+    first, again = found(SLOW, plan), found(SLOW, plan, count=8)
     assert first == again
     assert first.after.gains != found(SLOW, plan._replace(seed=1)).after.gains
     assert modelled
 
 
-class Interrupted(InThisProcess):
-    """^C after some jobs, once."""
-
-    def stream(self, work: Callable[..., Any], jobs: Iterable[Any]) -> Iterator[tuple[int, Any]]:
-        for result in super().stream(work, jobs):
-            yield result
-            if len(self.jobs) == 30:
-                raise KeyboardInterrupt
-
-
 def test_an_interrupt_ends_the_search_and_keeps_the_best_so_far(modelled: list[tuple[float, list[Case]]]) -> None:
-    result = found(own("Offset"), FEW._replace(max_chatter=1e9), Interrupted())
+    def interrupt(done: int, _total: int) -> None:
+        if done == 30:
+            raise KeyboardInterrupt
+
+    result = found(own("Offset"), FEW._replace(max_chatter=1e9), interrupt)
     assert (result.interrupted, result.candidates) == (True, 30)
     best = min((gain for gain, _ in modelled[:30] if gain <= 4), key=lambda gain: abs(gain - 3))
     assert result.after.gains["offset"] == best
@@ -174,13 +188,13 @@ def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
     modelled: list[tuple[float, list[Case]]],
 ) -> None:
     settings = load_over(SLOW, ["law.kind=pid", "law.kp=[1, 0.5, 2]", "law.ki=[0, 0, 0.1]"])
-    search = Search(settings, FEW, InThisProcess(), lambda *_: None)
+    search = Search(settings, FEW, workers_here(), lambda *_: None)
     assert [one.name for one in search.dimensions] == [
         "kp[0]", "kp[1]", "kp[2]", "kd[0]", "kd[1]", "kd[2]", "ki[2]"
     ]  # fmt: skip
-    scaled = Search(settings, FEW._replace(scale=True), InThisProcess(), lambda *_: None)
+    scaled = Search(settings, FEW._replace(scale=True), workers_here(), lambda *_: None)
     assert [one.name for one in scaled.dimensions] == ["kp", "kd", "ki"]
-    assert scaled._gains([log(3), 0.0, 0.0])["kp"] == pytest.approx((3, 1.5, 6))  # type: ignore[arg-type]  # a row
+    assert scaled.gains(np.array([log(3), 0.0, 0.0]))["kp"] == pytest.approx((3, 1.5, 6))
     assert scaled.dimensions[0].high == pytest.approx(log(10), abs=1e-4)  # 20 is the largest gain
     assert exp(search.dimensions[0].high) == pytest.approx(10)
     result = found(SLOW, FEW)
@@ -202,7 +216,7 @@ def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
     ],
 )
 def test_where_there_is_nothing_to_search_or_nothing_flies_it_is_one_line(
-    settings: Settings, plan: Plan, text: str
+    settings: Settings, plan: TuneOptions, text: str
 ) -> None:
     with pytest.raises(TuneError, match=text):
         found(settings, plan._replace(duration_s=2.0))
@@ -244,7 +258,7 @@ def test_the_command_prints_json_writes_toml_and_opens_no_network(
         raise AssertionError("a network")
 
     monkeypatch.setattr("zenoh.open", opened)
-    monkeypatch.setattr(workers, "Workers", InThisProcess)
+    run_here(monkeypatch)
     out = tmp_path / "gains.toml"
     words = ["--seeds", "1", "--winds", "0", "--budget", "100", "--max-chatter", "1e9"]
     law = [*AT_REST, f"law.kind={HERE}:Offset"]
@@ -269,14 +283,15 @@ def test_the_command_prints_json_writes_toml_and_opens_no_network(
 def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    def runs(_config: str, law: LawValues, cases: Sequence[Case], _duration_s: float) -> list[Ran]:
+    def runs(settings: Settings, cases: Sequence[Case], duration_s: float) -> list[Ran]:
         """Seed 0 likes 3, and the others do not."""
-        return [optimum(law["offset"] if case.seed == 0 else 3.4 - law["offset"]) for case in cases]  # 0.5: 2.9
+        assert duration_s > 0
+        gain = first_gain(settings)
+        return [optimum(gain if case.seed == 0 else 3.4 - gain) for case in cases]  # 0.5: 2.9
 
-    for module in (tune, tune_search):
-        monkeypatch.setattr(module, "run_cases", runs)
-    monkeypatch.setattr(tune, "survives", lambda *_: None)
-    monkeypatch.setattr(workers, "Workers", InThisProcess)
+    monkeypatch.setattr(tune, "run_cases", runs)
+    survives(monkeypatch, NOTHING)
+    run_here(monkeypatch)
     out = tmp_path / "gains.toml"
     words = ["--seeds", "1", "--winds", "0", "--budget", "100", "--max-chatter", "1e9", "--out", str(out)]
     assert printed([*AT_REST, f"law.kind={HERE}:Offset"], *words) == 1
@@ -287,16 +302,16 @@ def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
 def test_a_limit_that_is_exceeded_in_what_is_held_out_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def runs(_config: str, law: LawValues, cases: Sequence[Case], _duration_s: float) -> list[Ran]:
-        ran = optimum(law["offset"])
+    def runs(settings: Settings, cases: Sequence[Case], duration_s: float) -> list[Ran]:
+        assert duration_s > 0
+        ran = optimum(first_gain(settings))
         return [ran._replace(changes_per_s=(1 + case.seed) * ran.changes_per_s) for case in cases]
 
-    for module in (tune, tune_search):
-        monkeypatch.setattr(module, "run_cases", runs)
-    monkeypatch.setattr(tune, "survives", lambda *_: None)
+    monkeypatch.setattr(tune, "run_cases", runs)
+    survives(monkeypatch, NOTHING)
     result = found(own("Offset"), FEW._replace(max_chatter=500.0))
     assert (result.exceeded, result.worse) == (["changes_per_s"], None)
-    tune_table.tune_table(result)
+    show_all(sheets(result))
     assert "exceed a limit in the held-out set: changes_per_s" in capsys.readouterr().out
 
 
@@ -304,7 +319,7 @@ def test_without_scipy_one_line_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    monkeypatch.setattr(workers, "Workers", InThisProcess)
+    run_here(monkeypatch)
     assert printed(["loop.rate_hz=100"]) == 1
     assert "this needs scipy, which is not installed: pip install 'aeroloop[" in capsys.readouterr().err
 
@@ -321,16 +336,6 @@ def test_one_loop_serves_a_search_and_gains_of_its_settings_are_another(monkeypa
     monkeypatch.setattr(loop_function, "_loops", {})
     for law, loops in (("Offset", 1), ("Stubborn", 2)):
         built.clear()
-        runs = [tune_runs.run_case(own(law, f"law.offset={offset}"), 0.2) for offset in (0.5, 1.5)]
+        runs = [run_case(own(law, f"law.offset={offset}"), 0.2) for offset in (0.5, 1.5)]
         assert runs[0].u_total == pytest.approx(9 * runs[1].u_total)
         assert len(built) == loops
-
-
-def test_no_table_is_wider_than_a_terminal(
-    modelled: list[tuple[float, list[Case]]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    tune_table.tune_table(found(SLOW, FEW))
-    lines = capsys.readouterr().out.splitlines()
-    assert max(len(line) for line in lines if "before" in line or "deg" in line) <= 80
-    assert modelled

@@ -9,7 +9,8 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from aeroloop.service.config import load
-from aeroloop.service.terminal import certificate_table
+from aeroloop.service.terminal import show
+from aeroloop.service.terminal.certificate_table import certificate_sheets
 from aeroloop.service.theorem.certificate import Certificate, certify
 
 
@@ -18,9 +19,9 @@ def certificate(*overrides: str) -> Certificate:
 
 
 def lines(found: Certificate, monkeypatch: pytest.MonkeyPatch, *, verbose: bool, width: int = 80) -> list[str]:
-    screen = Console(width=width, file=StringIO())
-    monkeypatch.setattr(certificate_table, "Console", lambda: screen)
-    certificate_table.certificate_table(found, verbose=verbose)
+    screen = Console(width=width, file=StringIO(), force_terminal=True, color_system=None)
+    monkeypatch.setattr(show, "Console", lambda: screen)
+    show.show_all(certificate_sheets(found, verbose))
     assert isinstance(screen.file, StringIO)
     return screen.file.getvalue().splitlines()
 

@@ -20,7 +20,8 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.terminal.certificate_table import certificate_table
+from aeroloop.service.terminal.certificate_table import certificate_sheets
+from aeroloop.service.terminal.show import show_all
 from aeroloop.service.theorem.bounds import attitude_error
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.configured import with_theorem
@@ -170,7 +171,7 @@ def test_without_a_set_no_mean_square_is_claimed_of_a_sampled_loop(
     found = certify(settings)
     assert found.k is not None
     assert (found.pointwise_radius, found.rms_radius, found.radius, found.value("√(δ_Q/k)")) == (None,) * 4
-    certificate_table(found, verbose=True)
+    show_all(certificate_sheets(found, verbose=True))
     shown = capfd.readouterr().out
     assert re.search(r"root of the mean square +not proven", shown)
     assert re.search(r"√\(δ_Q/k\) +–", shown)

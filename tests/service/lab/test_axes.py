@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import ConfigError, load
 from aeroloop.service.config_sources import tree_of
-from aeroloop.service.sweep.axes import Axis, configurations, digest_of, parse_axes
+from aeroloop.service.lab.axes import Axis, configurations, digest_of, parse_axes
 
 BENCH = load()
 SCALARS = (

@@ -1,23 +1,26 @@
-"""Sweep in one process: the table, what is run and what is resumed."""
+"""Sweep in one process: the file of rows, the table, what is run and what is resumed."""
 
 from __future__ import annotations
 
+import csv
 import json
-import sys
+import re
+import resource
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.lab import sweep as module
+from aeroloop.service.lab.axes import configurations, parse_axes
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.sweep import sweep as module
-from aeroloop.service.sweep.axes import parse_axes
-from aeroloop.service.sweep.rows import Rows, SweepError, measured
-from aeroloop.service.sweep.sweep import Sweep, plan, run_sweep
-from tests.support.in_this_process import InThisProcess
+from aeroloop.service.lab.sweep import COLUMNS, Key, Row, RowFile, Sweep, SweepError, SweepPlan, run_sweep
+from tests.support.in_this_process import run_here
 
 BENCH = load(overrides=["plant.sensors.rate=gyro", "plant.sensors.gyro_noise=0.01"])
 BITS = "wire.voltage.bits=4,6"
@@ -26,12 +29,17 @@ S = 0.3
 
 @pytest.fixture(autouse=True)
 def _no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "Workers", InThisProcess)
+    run_here(monkeypatch)
+
+
+def plan(*vary: str, seeds: int = 1) -> SweepPlan:
+    axes = parse_axes(vary)
+    return SweepPlan(BENCH, axes, configurations(BENCH, axes, seeds, S), seeds, S)
 
 
 def swept(out: Path, *vary: str, seeds: int = 1) -> tuple[Sweep, list[dict[str, Any]]]:
     """What a sweep did, and the rows of its table."""
-    result = run_sweep(plan(BENCH, parse_axes(vary), seeds, S), out)
+    result = run_sweep(plan(*vary, seeds=seeds), out)
     return result, pq.read_table(out).to_pylist()
 
 
@@ -49,6 +57,15 @@ def test_a_row_has_the_values_the_seed_and_the_figures_of_its_experiment(tmp_pat
         assert row["command_frames_per_s"] == figures.command.frames_per_s
         assert row["reason"] is None
     assert len({row["u_total"] for row in rows}) == 4
+
+
+def test_a_csv_file_has_the_same_rows(tmp_path: Path) -> None:
+    _, rows = swept(tmp_path / "a.parquet", BITS)
+    run_sweep(plan(BITS), tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        read = list(csv.DictReader(file))
+    assert [float(row["z_track"]) for row in read] == [row["z_track"] for row in rows]
+    assert list(read[0]) == list(rows[0])
 
 
 def test_a_run_that_trips_is_a_row_with_its_reason(tmp_path: Path) -> None:
@@ -74,7 +91,7 @@ def test_a_sweep_that_gets_more_values_and_seeds_runs_those_alone_and_ends_in_th
 def test_rows_of_another_version_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "a.parquet"
     swept(out, BITS)
-    monkeypatch.setattr(module, "fingerprint", lambda: "0.2.1+other")
+    monkeypatch.setattr(module, "code_version", lambda: "0.2.1+other")
     result, rows = swept(out, BITS)
     assert (result.done, result.resumed) == (2, 0)
     assert {row["version"] for row in rows} == {"0.2.1+other"}
@@ -87,20 +104,8 @@ def test_each_row_is_in_the_file_before_its_job_counts_as_done(tmp_path: Path) -
     def count(done: int, total: int) -> None:
         counted.append((done, total, len(out.with_suffix(".jsonl").read_bytes().splitlines()) - 1))
 
-    run_sweep(plan(BENCH, parse_axes([BITS]), 1, S), out, progress=count)
+    run_sweep(plan(BITS), out, progress=count)
     assert counted == [(0, 2, 0), (1, 2, 1), (2, 2, 2)]
-
-
-def test_jobs_grow_to_what_fills_their_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    workers = InThisProcess()
-    monkeypatch.setattr(module, "Workers", lambda _: workers)
-    monkeypatch.setattr(module, "run_tasks", _cheap)
-    swept(tmp_path / "a.parquet", seeds=100)
-    assert [len(tasks) for _, _, tasks, _ in workers.jobs] == [1, 10, 10, 10, 10, 10, 10, 10, 10, 10, 9]
-
-
-def _cheap(_sweep: str, _config: str, tasks: list[Any], _duration_s: float) -> Any:
-    return [measured("no run")] * len(tasks), module.Spent(1, len(tasks), module.JOB_S / 10 * len(tasks))
 
 
 def test_the_command_prints_what_it_did_and_goes_on_without_force(
@@ -112,7 +117,7 @@ def test_the_command_prints_what_it_did_and_goes_on_without_force(
     assert json.loads(capfd.readouterr().out)["done"] == 2
     assert execute(command) == 0
     text = capfd.readouterr().out
-    assert "resumed                 2" in text
+    assert re.search(r"resumed +2\b", text)
     assert str(out) in "".join(text.split())
 
 
@@ -133,16 +138,15 @@ FLOWN = ("--vary", BITS, "--seeds", "2", "--duration", "0.1")
         pytest.param((*FLOWN[:4], "--duration", "0.2"), False, id="another duration"),
     ],
 )
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
 def test_a_table_is_not_replaced_by_another_sweep_without_force(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], replaces: bool
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], replaces: bool, suffix: str
 ) -> None:
-    out = tmp_path / "a.parquet"
+    out = tmp_path / f"a.{suffix}"
     assert execute(["lab", "sweep", *FLOWN, "--out", str(out)]) == 0
-    rows = pq.read_table(out).num_rows
     table = out.read_bytes()
     assert execute(["lab", "sweep", *words, "--out", str(out)]) == (0 if replaces else 2)
     assert ("name another file, or replace it with --force" in capfd.readouterr().err) != replaces
-    assert pq.read_table(out).num_rows >= rows
     assert replaces or out.read_bytes() == table
     assert execute(["lab", "sweep", *words, "--out", str(out), "--force"]) == 0
 
@@ -159,7 +163,7 @@ def test_a_table_of_another_version_is_not_replaced_without_force(
     assert execute(command) == 0
     assert execute(command) == 0
     if changed == "aeroloop":
-        monkeypatch.setattr("aeroloop.service.sweep.table.fingerprint", lambda: "0.2.1+other")
+        monkeypatch.setattr(module, "code_version", lambda: "0.2.1+other")
     else:
         law.write_text(text + "    other = 2.0\n")
     table = out.read_bytes()
@@ -174,28 +178,101 @@ def test_files_of_others_are_left_alone(capfd: pytest.CaptureFixture[str], tmp_p
     assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(out)]) == 2
     assert "exists already" in capfd.readouterr().err
     assert out.read_text() == "mine"
-    assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "a.csv")]) == 2
-    assert "a .parquet file" in capfd.readouterr().err
+    assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "a.mat")]) == 2
+    assert "a .parquet or .csv file" in capfd.readouterr().err
     (tmp_path / "b.jsonl").write_text("mine")
     assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "b.parquet")]) == 1
     assert "does not hold a sweep" in capfd.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.parquet", "b.jsonl"]
 
 
-@pytest.mark.parametrize("verb", ["tables", "burden", "sweep --out a.parquet"])
-def test_an_engine_that_is_none_is_refused(capfd: pytest.CaptureFixture[str], verb: str) -> None:
-    assert execute(["lab", *verb.split(), "--engine", "spark"]) == 2
-    assert capfd.readouterr().err == "aeroloop: --engine must be processes or dask:ADDRESS, not 'spark'\n"
+# ── the file of rows ──
 
 
-def test_without_dask_the_extra_is_named(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "aeroloop.service.lab.dask_workers", raising=False)
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert execute(["lab", "tables", "--engine", "dask:127.0.0.1:1"]) == 1
-    assert capfd.readouterr().err.endswith("pip install 'aeroloop[dask]'\n")
+def row(**figures: Any) -> Row:
+    return dict.fromkeys(COLUMNS) | figures
 
 
-def test_two_sweeps_into_one_file_are_refused(tmp_path: Path) -> None:
-    out = tmp_path / "a.parquet"
-    with Rows(tmp_path / "a.jsonl"), pytest.raises(SweepError, match="in use"):
-        swept(out, BITS)
+ROWS = {
+    Key("a" * 64, 0, "0.2.0+1"): row(z_track=0.1 + 0.2, u_total=5e-324, skipped_ticks=3),
+    Key("a" * 64, 1, "0.2.0+1"): row(reason="the loop ended after 1 s: tilt of 91° – “limit”"),
+    Key("b" * 64, 0, "0.2.0+1"): row(z_track=float("inf"), command_bits_per_s=1 / 3),
+}
+
+
+def whole(path: Path) -> bytes:
+    """A file of ROWS."""
+    with RowFile(path) as rows:
+        for key, each in ROWS.items():
+            rows.append(key, each)
+    return path.read_bytes()
+
+
+def found(path: Path) -> dict[Key, Row]:
+    """The rows in a file."""
+    with RowFile(path) as rows:
+        return rows.found
+
+
+def test_rows_are_read_as_they_were_written_to_the_last_bit(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    whole(path)
+    assert found(path) == ROWS
+
+
+@given(st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_file_cut_off_anywhere_keeps_its_whole_lines_and_takes_the_others_again(
+    tmp_path: Path, data: st.DataObject
+) -> None:
+    path = tmp_path / "a.jsonl"
+    path.unlink(missing_ok=True)
+    complete = whole(path)
+    length = data.draw(st.integers(0, len(complete)))
+    path.write_bytes(complete[:length])
+    kept = complete[:length].count(b"\n") - 1  # without the head
+    with RowFile(path) as rows:
+        assert list(rows.found.items()) == list(ROWS.items())[: max(0, kept)]
+        for key, each in ROWS.items():
+            if key not in rows.found:
+                rows.append(key, each)
+    assert path.read_bytes() == complete
+
+
+@pytest.mark.parametrize("text", ["hello", "hello\n", '{"seed": 0}\n', '{"aeroloop": "diary"}\n'])
+def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.jsonl"
+    path.write_text(text)
+    with pytest.raises(SweepError, match="does not hold a sweep"):
+        RowFile(path)
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize("line", [b"{}", b"[1]", b"0", b'{"configuration": "a"', b"\x00\x00\xff"])
+def test_a_damaged_line_is_named(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / "a.jsonl"
+    lines = whole(path).splitlines()
+    path.write_bytes(b"\n".join([*lines[:2], line, *lines[2:], b""]))
+    with pytest.raises(SweepError, match="line 3"):
+        RowFile(path)
+
+
+def test_a_file_serves_one_sweep_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    with RowFile(path), pytest.raises(SweepError, match="in use by another sweep"):
+        RowFile(path)
+    assert found(path) == {}
+
+
+def test_a_disk_that_takes_half_a_row_ends_the_sweep_and_the_half_is_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    whole(path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with RowFile(path) as rows:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, before[1]))
+        try:
+            with pytest.raises(SweepError, match="cannot be written"):
+                rows.append(Key("c", 0, "0.2.0+1"), row())
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert found(path) == ROWS

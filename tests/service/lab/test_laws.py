@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,16 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.sweep import laws as laws_module
-from aeroloop.service.sweep import sweep
-from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
+from aeroloop.service.lab.law_margins import Late, least
+from aeroloop.service.lab.laws import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
-from tests.support.in_this_process import InThisProcess
+from tests.support.in_this_process import run_here
 
 SLOW = load(overrides=["loop.rate_hz=100"])
 RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
@@ -28,7 +29,9 @@ RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:
     """The configuration of every combination."""
     plan, choices, *_ = compare(settings, **given, duration_s=1.0)
-    return {choice: load_over(settings, each.overrides) for choice, each in zip(choices, plan.found, strict=True)}
+    return {
+        choice: load_over(settings, each.overrides) for choice, each in zip(choices, plan.configurations, strict=True)
+    }
 
 
 def test_by_default_every_law_of_ours_flies_both_plants_calm_and_in_wind_with_two_choices_of_bits() -> None:
@@ -78,8 +81,7 @@ def test_an_unknown_choice_is_one_line(given: dict[str, Any], text: str) -> None
 def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_have_their_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (sweep, laws_module):  # what workers bring back: test_engines.py
-        monkeypatch.setattr(module, "Workers", InThisProcess)
+    run_here(monkeypatch)  # what workers bring back: test_workers.py
     out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
     laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
     few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero", "--duration", "3", "--set", "loop.rate_hz=100"]
@@ -110,18 +112,57 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     assert out.read_bytes() == before
     assert execute(["lab", "laws", *laws, *few, "--markdown"]) == 0
     text = capsys.readouterr().out
-    assert f"| {RUNAWAY} | the loop ended after" in text
+    assert f"| {RUNAWAY} | – |" in text
+    assert f"{RUNAWAY}: the loop ended after" in text
     assert "| pd | none |" not in text
 
 
 def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(law_margins, "PUSHED_S", 4.0)
     settings = load_over(SLOW, ["law.kind=pd"])
-    for lost in (False, True):
-        most = law_margins.survives(settings.description(), lost, 10.0)
-        assert most is not None
-        errors = [
-            law_margins.largest_error_deg(settings, *((0, ticks) if lost else (ticks, 0))) for ticks in (most, most + 1)
-        ]
+    found = law_margins.survived(settings, 10.0)
+    delay, lost = found["delay_ms"], found["lost_frames"]
+    assert delay
+    assert lost
+    ticks, frames = round(delay / 10), round(lost)
+    for kept, too_late in (((ticks, 0), (ticks + 1, 0)), ((0, frames), (0, frames + 1))):
+        errors = [law_margins.largest_error_deg(settings, *late) for late in (kept, too_late)]
         assert errors[0] <= 10 < errors[1]
-    assert law_margins.survives(settings.description(), False, 0.01) is None
+    assert law_margins.survived(settings, 0.01)["delay_ms"] is None
+
+
+class Recording(EmulatedPlant):
+    """Keeps what is in force in every period."""
+
+    def __init__(self) -> None:
+        self.actuators, self.periods = 3, list[float]()
+        self.in_force: tuple[float, ...] = (0.0,)
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.in_force = tuple(voltages)
+
+    def advance(self) -> None:
+        self.periods.append(self.in_force[0])
+
+
+@pytest.mark.parametrize(
+    ("delay", "lost", "in_force"),
+    [
+        (0, 0, [1, 2, 3, 4, 5, 6, 7]),
+        (2, 0, [0, 0, 1, 2, 3, 4, 5]),
+        (0, 2, [1, 1, 1, 4, 4, 4, 7]),
+        (1, 1, [0, 0, 2, 2, 4, 4, 6]),
+    ],
+)
+def test_a_command_acts_late_or_until_the_next_that_is_not_lost(delay: int, lost: int, in_force: list[float]) -> None:
+    body = Recording()
+    plant = Late(body, delay, lost)
+    for k in range(1, 8):
+        plant.actuate([float(k)] * 3)
+        plant.advance()
+    assert body.periods == in_force
+
+
+@pytest.mark.parametrize("first", [0, 1, 2, 9, 10, 11, 37, 80, 81, 1000])
+def test_the_search_finds_the_first_number_that_fails(first: int) -> None:
+    assert least(lambda ticks: ticks >= first, guess=10, most=100) == (first if first <= 80 else None)

@@ -18,8 +18,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from aeroloop.service.lab.laws import LawMargin, LawRow, Laws
 from aeroloop.service.report.figure_style import BLACK, BLUE, ORANGE, WIDTH_IN, figure_style, save_as
-from aeroloop.service.sweep.laws import LawMargin, LawRow, Laws
 
 _COLOURS: Final = {"calm": BLUE, "wind": ORANGE}
 _SHAPES: Final = "osD^vP"

@@ -1,0 +1,129 @@
+"""Printer of results: rows of text as a table for a terminal, as Markdown, CSV or JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Final, Literal, TypeAlias, TypeVar
+
+import typer
+from pydantic import BaseModel
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+Row: TypeAlias = dict[str, str]
+Format: TypeAlias = Literal["terminal", "markdown", "csv", "json"]
+
+Result = TypeVar("Result", bound=BaseModel)
+
+_PIPE_WIDTH: Final = 160
+_GAP: Final = 2
+
+
+def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
+    """Print rows, all with the same columns, and a title; without rows the title is a paragraph.
+
+    Args:
+        rows: From column to text.
+        title: Above the table, in a terminal and in Markdown.
+        form: One of four.
+        keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
+    """
+    if form == "json":
+        typer.echo(json.dumps(rows, ensure_ascii=False, indent=2))
+    elif form == "csv":
+        writer = csv.DictWriter(sys.stdout, list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
+    elif form == "markdown":
+        typer.echo("\n".join(_markdown(rows, title)))
+    else:
+        _in_terminal(rows, title, keys)
+
+
+def show_all(sheets: Iterable[tuple[str, Sequence[Row]]], form: Format = "terminal", keys: int = 1) -> None:
+    """Print tables and paragraphs, with a line between them."""
+    for i, (title, rows) in enumerate(sheets):
+        if i:
+            typer.echo("")
+        show(rows, title, form, keys)
+
+
+def show_result(
+    result: Result,
+    sheets: Callable[[Result], Iterable[tuple[str, Sequence[Row]]]],
+    *,
+    json: bool,
+    markdown: bool = False,
+    keys: int = 1,
+) -> None:
+    """Print a result of a command: all of it as JSON, or as the tables that a function makes of it."""
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        show_all(sheets(result), "markdown" if markdown else "terminal", keys)
+
+
+def _markdown(rows: Sequence[Row], title: str) -> list[str]:
+    if not rows:
+        return [title]
+    heading = [f"**{title}**", ""] if title else []
+    rule = "".join("|--:" if right else "|---" for right in _right(rows))
+    return [*heading, *(f"| {' | '.join(cells)} |" for cells in (rows[0],)), f"{rule}|",
+            *(f"| {' | '.join(row.values())} |" for row in rows)]  # fmt: skip
+
+
+def _right(rows: Sequence[Row]) -> list[bool]:
+    """Which columns hold numbers, and so stand to the right: never the first."""
+
+    def numbers(column: str) -> bool:
+        return all(any(map(str.isdigit, row[column])) for row in rows if row[column] not in ("–", "", "none"))
+
+    return [i > 0 and numbers(column) for i, column in enumerate(rows[0])]
+
+
+def _in_terminal(rows: Sequence[Row], title: str, keys: int) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
+    if title:
+        console.print(Text(title, style="italic" if rows else ""), soft_wrap=not console.is_terminal)
+    if not rows:
+        return
+    least = {name: _least(rows, name, console.width) for name in rows[0]}
+    right = dict(zip(rows[0], _right(rows), strict=True))
+    for columns in _blocks(least, console.width, keys):
+        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
+        whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in columns}
+        folds = sum(whole.values()) + _GAP * (len(columns) - 1) > console.width
+        for name in columns:
+            is_long = max(cell_len(row[name]) for row in rows) > least[name]
+            width = least[name] if folds and not is_long else None
+            table.add_column(name, justify="right" if right[name] else "left", width=width, min_width=least[name])
+        for row in rows:
+            table.add_row(*(Text(row[name]) for name in columns))
+        console.print(table)
+
+
+def _least(rows: Sequence[Row], name: str, available: int) -> int:
+    """Least width of a column: its title and texts over a third of a line fold between words, others do not."""
+    cells = [row[name] for row in rows]
+    folding = [text for text in cells if cell_len(text) > available / 3]
+    whole = [] if folding else cells
+    return max(map(cell_len, (*whole, *(word for text in (name, *folding) for word in text.split()), "")))
+
+
+def _blocks(least: Mapping[str, int], available: int, keys: int) -> list[list[str]]:
+    """Columns of each block: all in one where they fit beside each other."""
+    first, *others = [*least][:keys], *[*least][keys:]
+    blocks = [[*first]]
+    for name in others:
+        width = sum(least[each] for each in blocks[-1]) + _GAP * len(blocks[-1]) + least[name]
+        if len(blocks[-1]) > keys and width > available:
+            blocks.append([*first])
+        blocks[-1].append(name)
+    return blocks

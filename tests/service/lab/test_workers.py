@@ -1,0 +1,206 @@
+"""Workers: processes that are interrupted or killed, and a Dask cluster of two workers whose scheduler runs here.
+
+Nothing is timed: a test waits for rows or results, for at most PATIENCE_S, as a shared machine can be slow.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import pytest
+from distributed import Client, LocalCluster
+
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings, load
+from aeroloop.service.lab.axes import configurations, parse_axes
+from aeroloop.service.lab.sweep import Sweep, SweepPlan, run_sweep
+from aeroloop.service.lab.workers import Run, WorkersError, code_version, open_workers, run_of
+from tests.support.in_this_process import run_here, workers_here
+
+pytestmark = pytest.mark.processes
+
+PATIENCE_S: Final = 60.0
+VARY: Final = "wire.voltage.bits=4,6"
+SEEDS: Final = 6
+S: Final = 1.0
+
+
+def planned() -> SweepPlan:
+    settings = load(overrides=["plant.sensors.rate=gyro", "plant.sensors.gyro_noise=0.01"])
+    axes = parse_axes([VARY])
+    return SweepPlan(settings, axes, configurations(settings, axes, SEEDS, S), SEEDS, S)
+
+
+def rate_over(settings: Settings, divisor: int) -> float:
+    return settings.loop.rate_hz / divisor
+
+
+def rates(*hertz: int) -> list[Run]:
+    return [run_of(load(), [f"loop.rate_hz={each}"]) for each in hertz]
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The table of the sweep, made in this process."""
+    out = tmp_path_factory.mktemp("local") / "a.parquet"
+    with pytest.MonkeyPatch.context() as patched:
+        run_here(patched)
+        run_sweep(planned(), out)
+    return out.read_bytes()
+
+
+@pytest.fixture(autouse=True)
+def _patience() -> Iterator[None]:
+    """A job that is lost would be waited for without end."""
+
+    def end(*_: object) -> None:
+        raise TimeoutError("the sweep does not end")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(4 * int(PATIENCE_S))
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def test_results_come_in_order_whatever_the_batches_and_whichever_ends_first() -> None:
+    runs, counted = rates(*range(400, 440)), list[int]()
+    for workers in (workers_here(), workers_here(8, batch_s=100.0)):
+        counted.clear()
+        assert workers.rows(partial(rate_over, divisor=2), runs, counted.append) == [
+            rate / 2 for rate in range(400, 440)
+        ]
+        assert counted == list(range(1, 41))
+    assert 16 < len(workers.batches) <= 40
+
+
+def test_batches_grow_to_what_fills_their_time() -> None:
+    workers = workers_here(batch_s=1e9)
+    workers.rows(partial(rate_over, divisor=1), rates(*range(400, 500)))
+    sizes = [count for _, count in workers.batches]
+    assert sizes[0] == sizes[-1] == 1
+    assert max(sizes) == 24  # a quarter of what is left
+
+
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
+def test_a_sweep_that_is_stopped_runs_only_what_is_missing_and_ends_in_the_same_table(
+    local: bytes, tmp_path: Path, stop: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, rows = tmp_path / "a.parquet", tmp_path / "a.jsonl"
+    noise = ["--set", "plant.sensors.rate=gyro", "--set", "plant.sensors.gyro_noise=0.01"]
+    options = ["--vary", VARY, "--seeds", str(SEEDS), "--duration", str(S), "--out", str(out)]
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "aeroloop", "lab", "sweep", *options, *noise],
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in a background job
+    )
+    deadline = time.monotonic() + PATIENCE_S
+    while not rows.exists() or rows.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(stop)
+    process.wait()
+    assert not out.exists()
+    kept = rows.read_bytes().count(b"\n") - 1
+    run_here(monkeypatch)
+    result = run_sweep(planned(), out)
+    assert (result.resumed, result.done) == (kept, 2 * SEEDS - kept)
+    assert out.read_bytes() == local
+
+
+def test_a_worker_process_that_ends_is_one_line() -> None:
+    with open_workers() as workers, pytest.raises(WorkersError, match="a worker process ended in the middle of a job"):
+        workers.rows(end, rates(400, 500))
+
+
+def end(_settings: Settings) -> None:
+    os._exit(1)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[LocalCluster]:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+        yield cluster
+
+
+def swept(cluster: LocalCluster, out: Path, kill: int | None = None) -> Sweep:
+    """The sweep on the cluster, of which one worker is killed once four experiments are done."""
+
+    def progress(done: int, _total: int) -> None:
+        if done == 4 and kill is not None:
+            os.kill(kill, signal.SIGKILL)
+
+    return run_sweep(planned(), out, engine=f"dask:{cluster.scheduler_address}", progress=progress)
+
+
+def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
+    cluster: LocalCluster, local: bytes, tmp_path: Path
+) -> None:
+    out = tmp_path / "a.parquet"
+    result = swept(cluster, out, kill=next(iter(cluster.workers.values())).pid)
+    assert (result.done, result.resumed, result.failed) == (2 * SEEDS, 0, 0)
+    assert out.read_bytes() == local
+
+
+def test_a_worker_with_several_threads_runs_one_experiment_at_a_time(tmp_path: Path) -> None:
+    """Threads of one process share compiled loops."""
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=4, dashboard_address=":0") as threads,
+        open_workers(f"dask:{threads.scheduler_address}") as workers,
+    ):
+        workers.rows(partial(alone, path=str(tmp_path / "busy")), rates(*range(400, 420)))
+
+
+def alone(_settings: Settings, path: str) -> None:
+    """Fails if it runs in two threads at a time."""
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+    time.sleep(0.02)
+    os.unlink(path)
+
+
+def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) -> None:
+    with open_workers(f"dask:{cluster.scheduler_address}") as workers:
+        work = partial(rate_over, divisor=2)
+        assert workers.rows(work, rates(400, 500, 450)) == [200, 250, 225]
+        with pytest.raises(ZeroDivisionError):
+            workers.rows(partial(rate_over, divisor=0), rates(400))
+
+
+def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
+    name = "from aeroloop.service.lab import workers as w; w.code_version ="
+    with Client(cluster.scheduler_address, set_as_default=False) as client:
+        client.run(exec, f"{name} lambda: '0.2.0+other'", {})
+        with pytest.raises(WorkersError, match=rf"runs aeroloop 0\.2\.0\+other, this machine {code_version()[:5]}"):
+            swept(cluster, tmp_path / "a.parquet")
+        client.run(exec, f"{name} lambda: {code_version()!r}", {})
+    assert not (tmp_path / "a.parquet").exists()
+
+
+def test_where_there_is_no_scheduler_or_no_worker_one_line_says_so(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert execute(["lab", "tables", "--engine", "dask:tcp://127.0.0.1:1"]) == 1
+    assert capfd.readouterr().err.startswith("aeroloop: no Dask scheduler answers at tcp://127.0.0.1:1: ")
+    none = pytest.raises(WorkersError, match=r"no worker at tcp://.*--nthreads 1` starts one")
+    with LocalCluster(n_workers=0, dashboard_address=":0") as empty, none:
+        run_sweep(planned(), tmp_path / "a.parquet", engine=f"dask:{empty.scheduler_address}")
+
+
+@pytest.mark.parametrize("verb", ["tables", "burden", "laws", "tune", "sweep --out a.parquet"])
+def test_an_engine_that_is_none_is_refused(capfd: pytest.CaptureFixture[str], verb: str) -> None:
+    assert execute(["lab", *verb.split(), "--engine", "spark"]) == 2
+    assert capfd.readouterr().err == "aeroloop: --engine must be processes or dask:ADDRESS, not 'spark'\n"
+
+
+def test_without_dask_the_extra_is_named(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert execute(["lab", "tables", "--engine", "dask:127.0.0.1:1"]) == 1
+    assert capfd.readouterr().err.endswith("pip install 'aeroloop[dask]'\n")

@@ -1,0 +1,61 @@
+"""Printer of results: the same rows for a terminal of any width, as Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+from io import StringIO
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from aeroloop.service.terminal import show as module
+from aeroloop.service.terminal.show import Row, show, show_all
+
+ROWS: list[Row] = [
+    {"law": "adaptive", **{f"figure {i} of several": f"{i}.{i} (×1.0{i})" for i in range(8)}, "reason": ""},
+    {"law": "pd", **{f"figure {i} of several": "–" for i in range(8)}, "reason": "the loop ended after 1 s, as it had"},
+]
+
+
+def screen(monkeypatch: pytest.MonkeyPatch, width: int) -> StringIO:
+    console = Console(width=width, force_terminal=True, color_system=None, file=StringIO())
+    monkeypatch.setattr(module, "Console", lambda: console)
+    assert isinstance(console.file, StringIO)
+    return console.file
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 300])
+def test_no_line_is_wider_than_the_terminal_and_every_figure_stands_whole_beside_its_key(
+    monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    out = screen(monkeypatch, width)
+    show(ROWS, "two laws")
+    lines = out.getvalue().splitlines()
+    assert lines[0].strip() == "two laws"
+    assert max(map(cell_len, lines)) <= width
+    for i in range(8):
+        assert any("adaptive" in line and f"{i}.{i} (×1.0{i})" in line for line in lines)
+    assert len([line for line in lines if "adaptive" in line]) == (1 if width == 300 else pytest.approx(3, abs=2))
+    words = out.getvalue().split()
+    assert all(word in words for word in ROWS[1]["reason"].split())
+
+
+def test_rows_into_a_pipe_are_not_folded_at_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    show([{"law": "a", "kbit/s": "1.0", "what that is": "word " * 25}])
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_markdown_has_every_cell_and_numbers_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"law": "pd", "kbit/s": "1.0", "kind": "8 bits, uniform"}, {"law": "2", "kbit/s": "–", "kind": "x"}]
+    show_all([("laws", rows), ("a note", [])], "markdown")
+    table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | x |"]
+    assert capsys.readouterr().out.splitlines() == ["**laws**", "", *table, "", "a note"]
+
+
+def test_csv_and_json_are_the_rows(capsys: pytest.CaptureFixture[str]) -> None:
+    show(ROWS, "laws", "csv")
+    assert list(csv.DictReader(StringIO(capsys.readouterr().out))) == ROWS
+    show(ROWS, "laws", "json")
+    assert json.loads(capsys.readouterr().out) == ROWS
