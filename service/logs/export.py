@@ -157,9 +157,6 @@ def _pieces(
     for which in chosen:
         session = recording.session(which)
         ticks = recompute(session).ticks
-        if session.settings.loop.lockstep:  # the plant waits for each command
-            unknown = np.full(len(ticks.k), np.nan)
-            ticks = ticks._replace(latency_ns=unknown, measurement_delay_ns=unknown, command_delay_ns=unknown)
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
             yield columns_of(Rows(*which, some, _true_at(truths[which], some.k)), session.settings)
