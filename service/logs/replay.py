@@ -122,7 +122,8 @@ def replay(
                 try:
                     one, words = _replay_session(recording, which, overrides, progress)
                     sessions.append(one)
-                    details.setdefault("controller", words)
+                    if words:
+                        details.setdefault("controller", words)
                 except AeroloopError as error:
                     if overrides:
                         raise

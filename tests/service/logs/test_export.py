@@ -307,6 +307,17 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
     assert (tmp_path / "there.csv").read_text() == "mine"
 
 
+def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Table) -> None:
+    part = ("--from", "0.3", "--until", "0.5")
+    assert execute(["log", "export", str(log), "--to", "parquet", "--out", str(tmp_path / "a.parquet"), *part]) == 0
+    table = pyarrow.parquet.read_table(tmp_path / "a.parquet").to_pydict()
+    assert table["tick"] == list(range(150, 251))
+    begin = parquet["tick"].index(150)
+    for name, column in table.items():
+        if "delay" not in name:  # the clocks' offset is fitted by what is read
+            assert column == parquet[name][begin : begin + 101], name
+
+
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
         assert execute(["log", "export", str(log), "--to", to, "--json"]) == 0
