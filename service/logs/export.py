@@ -28,7 +28,7 @@ from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, Integers, SessionKey
-from aeroloop.service.logs.table import Column, Kind, Rows, TruthColumns, columns_of, is_of_tick
+from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, is_of_tick
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -168,7 +168,7 @@ def _pieces(
         ticks = recompute(session).ticks
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
-            yield columns_of(Rows(*which, some, _true_at(truths[which], some.k)), session.settings)
+            yield columns_of(which, some, _true_at(truths[which], some.k), session.settings)
 
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:

@@ -8,7 +8,7 @@ again, bit for bit; after missing rows, the log has the controller's state.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
@@ -167,13 +167,13 @@ class LoggedController:
         return self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
 
 
-def rows_of(table: Table, *names: str, progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
-    """Index and some columns of each row, as Python's numbers and bytes."""
-    for begin in range(0, len(table), AT_A_TIME):
-        part = table[begin : begin + AT_A_TIME]
-        yield from zip(range(begin, begin + len(part)), *(part[name].tolist() for name in names), strict=True)
+def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
+    """The rows of some columns, as Python's numbers and bytes."""
+    size = len(columns[0])
+    for begin in range(0, size, AT_A_TIME):
+        yield from zip(*(column[begin : begin + AT_A_TIME].tolist() for column in columns), strict=True)
         if progress is not None:
-            progress((begin + len(part)) / len(table))
+            progress(min(1.0, (begin + AT_A_TIME) / size))
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -195,7 +195,7 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     silent = _is(controller, at, "sent_as", Sent.SILENT)
     answered = _is(controller, at, "sent_as", Sent.FRAME) | silent | (session.acted >= 0)
     until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
-    *times, offset_ns = _timed(session)
+    wall, sent, latency, there, back, offset_ns = _timed(session)
     volts = _voltages(session)
     columns, over = _computed(session, progress)
     valid = ~np.isnan(columns[1][:until, 0])  # where q was measured
@@ -204,7 +204,8 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     if not isinstance(judged, slice):
         for column in columns:
             column[: len(judged)] = column[judged]
-    k, wall, sent, latency, there, back, voltages = (column[judged] for column in (session.k, *times, volts))
+    k, wall, sent = (column[judged] for column in (session.k, wall, sent))
+    latency, there, back, voltages = (column[judged] for column in (latency, there, back, volts))
     state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = (c[: len(k)] for c in columns)
     commanded_at = slice(until) if answered[:until].all() else answered
     return Recomputed(
@@ -266,8 +267,8 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     waiting = deque(np.flatnonzero(over & (session.at_controller < 0)).tolist())
     failed: list[int] = []
     used_state = bytearray(state_bytes)
-    rows = rows_of(session.controller, "tick", "received_as", "measurement", progress=progress)
-    for (i, tick, received_as, frame), place in zip(rows, _integers(places), strict=True):
+    inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
+    for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
         while waiting and session.k[waiting[0]] < tick:
             compute_without(waiting.popleft())
         logged.resume(i)
@@ -288,11 +289,6 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     table[over, ends[-2] :] = nan
     table[failed, ends[-2] :] = nan
     return [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)], over
-
-
-def _integers(values: Places) -> Iterator[int]:
-    for begin in range(0, len(values), AT_A_TIME):
-        yield from values[begin : begin + AT_A_TIME].tolist()
 
 
 def _gains(session: Session, k: Integers) -> Array:

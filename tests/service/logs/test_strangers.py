@@ -188,7 +188,6 @@ def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alo
     clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its sessions are named, and as they could not be compared, the exit code is 1."""
-    recorded, _ = contents(clean)
     ghost = [
         one._replace(key=one.key.replace("/aero/", "/ghost/")) for one in contents(clean)[0] if one.topic == "trace"
     ]
