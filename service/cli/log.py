@@ -40,6 +40,14 @@ Vehicle = Annotated[
 group = typer.Typer()
 
 
+def _part(since_s: float | None, until_s: float | None, until: str) -> tuple[float, float]:
+    """From when to when to read, on the law's clock [s]; exits with 2 if that is no time. `until` names the option."""
+    part = -inf if since_s is None else since_s, inf if until_s is None else until_s
+    if part[0] >= part[1]:
+        fail(f"--from {part[0]:g} is not before {until} {part[1]:g}", 2)
+    return part
+
+
 @group.command()
 def review(
     logs: Logs,
@@ -76,11 +84,9 @@ def review(
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import review_account
 
-    if since_s is not None and until_s is not None and since_s >= until_s:
-        fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
+    begin_s, end_s = _part(since_s, until_s, "--to")
     with guarded():
         with share_bar("reading", hidden=json) as update:
-            begin_s, end_s = -inf if since_s is None else since_s, inf if until_s is None else until_s
             judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=begin_s, until_s=end_s)
         report = judged.report(limits)
         if figures is not None:
@@ -184,6 +190,12 @@ def export(
         typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.", show_default=False),
     ] = None,
     vehicle: Vehicle = None,
+    since_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Rows from this time on only.", show_default=False)
+    ] = None,
+    until_s: Annotated[
+        float | None, typer.Option("--until", metavar="S", help="Rows to this time only.", show_default=False)
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -201,6 +213,17 @@ def export(
         for one in exported.unknown:
             typer.echo(str(one))
 
+    times_s = _part(since_s, until_s, "--until")
     with guarded(), share_bar("exporting", hidden=json) as update:
-        exported = export(logs, to, out, session=session, vehicle=vehicle, force=force, progress=update)
+        exported = export(
+            logs,
+            to,
+            out,
+            session=session,
+            vehicle=vehicle,
+            since_s=times_s[0],
+            until_s=times_s[1],
+            force=force,
+            progress=update,
+        )
     show(exported, json, account)

@@ -12,9 +12,9 @@ from pathlib import Path
 from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.mcap_copy import Follow, McapCopy
 from aeroloop.service.logs.mcap_file import Damage
 from aeroloop.service.logs.recording import Progress, Recording
+from aeroloop.service.logs.recover import Follow, McapCopy
 from aeroloop.service.viewers.channels import Decoder
 
 

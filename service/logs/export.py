@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
+from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -27,7 +28,7 @@ from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, Integers, SessionKey
-from aeroloop.service.logs.table import Column, Kind, Rows, TruthColumns, columns_of, is_of_tick
+from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, is_of_tick
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -67,6 +68,8 @@ def export(
     *,
     session: str | None = None,
     vehicle: str | None = None,
+    since_s: float = -inf,
+    until_s: float = inf,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
@@ -78,6 +81,8 @@ def export(
         out: The file; the first log's name with another ending if None.
         session: As of `Recording.choose`, or `all` of the vehicle.
         vehicle: As of `Recording.choose`.
+        since_s: From when on, on the law's clock [s].
+        until_s: Until when [s].
         force: Replace an existing file, unless it is a log.
         progress: Called repeatedly with the share done, 0…1.
 
@@ -94,16 +99,17 @@ def export(
             if to == "mcap":
                 from aeroloop.service.logs.decoded_log import write_decoded
 
-                if session is not None or vehicle is not None:
+                if (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
                     raise ExportError(
-                        "--session and --vehicle choose the rows of a table; --to mcap writes the log with all of them"
+                        "--session, --vehicle, --from and --until choose the rows of a table; --to mcap writes all of "
+                        "the log"
                     )
                 rows, columns, damages = write_decoded(recording, part, progress or (lambda _: None))
             else:
                 first = recording.choose(None if session == ALL else session, vehicle)
                 chosen = recording.sessions_of(first[0]) if session == ALL else [first]
                 sessions = ["/".join(which) for which in chosen]
-                rows, columns, damages = _write_table(recording, to, part, chosen)
+                rows, columns, damages = _write_table(recording, to, part, chosen, (since_s, until_s))
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
@@ -128,7 +134,7 @@ def with_ending(log: Path, ending: str) -> Path:
 
 
 def _write_table(
-    recording: Recording, to: Format, part: Path, chosen: Sequence[SessionKey]
+    recording: Recording, to: Format, part: Path, chosen: Sequence[SessionKey], times_s: tuple[float, float]
 ) -> tuple[int, list[str], list[str]]:
     """Write a table; returns its number of rows, its columns' names, and what could not be read."""
     facts = {
@@ -139,7 +145,7 @@ def _write_table(
         "exported_by": versions(),
     }
     truths, malformed = _truths(recording, chosen)
-    pieces = _pieces(recording, chosen, truths)
+    pieces = _pieces(recording, chosen, times_s, truths)
     if (first := next(pieces, None)) is None:
         raise ExportError(f"{recording.name} has no answered measurement to export")
     if to == "mat":
@@ -151,18 +157,18 @@ def _write_table(
 
 
 def _pieces(
-    recording: Recording, chosen: Sequence[SessionKey], truths: Mapping[SessionKey, Array]
+    recording: Recording,
+    chosen: Sequence[SessionKey],
+    times_s: tuple[float, float],
+    truths: Mapping[SessionKey, Array],
 ) -> Iterator[list[Column]]:
     """The columns of some sessions, some rows at a time."""
     for which in chosen:
-        session = recording.session(which)
+        session = recording.session(which, *times_s)
         ticks = recompute(session).ticks
-        if session.settings.loop.lockstep:  # the plant waits for each command
-            unknown = np.full(len(ticks.k), np.nan)
-            ticks = ticks._replace(latency_ns=unknown, measurement_delay_ns=unknown, command_delay_ns=unknown)
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
-            yield columns_of(Rows(*which, some, _true_at(truths[which], some.k)), session.settings)
+            yield columns_of(which, some, _true_at(truths[which], some.k), session.settings)
 
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:

@@ -422,7 +422,7 @@ def check_memory(needed: int, ticks: int) -> None:
     if needed > available:
         raise ReviewError(
             f"{ticks} ticks take {needed / 2**30:.1f} GiB of memory, and {available / 2**30:.1f} GiB are available: "
-            "choose a part with --from and --to"
+            "`aeroloop log review` reads a part with --from and --to, `aeroloop log export` with --from and --until"
         )
 
 

@@ -1,14 +1,21 @@
-"""Recovery of a broken log: every whole record is copied into a new log with an index, and what was lost is named."""
+"""Recovery of a broken log: every whole record is copied into a new log with an index, and what was lost is named.
+
+The copy has its own ids. Messages keep their topic, schema, times and sequence. Repetitions are written once: schemas,
+channels, attachments, and a metadata record that equals the last one of its name and key.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from pathlib import Path
+from typing import BinaryIO
 
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import Writer
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.logs.mcap_copy import McapCopy
-from aeroloop.service.logs.mcap_file import Damage, NotMcapError
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, Damage, NotMcapError, records
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress
 
@@ -48,3 +55,88 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
     except OSError as error:
         raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
     return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=list(map(str, damages)))
+
+
+Follow = Callable[[Message], None]
+"""Called with each message of a channel after it was copied."""
+
+
+class McapCopy:
+    """Copies records into a new file, which is empty; counts its messages and collects its topics.
+
+    `library` is the name of the writing program.
+    """
+
+    def __init__(self, out: BinaryIO, library: str) -> None:
+        self.messages = 0
+        self.topics: set[str] = set()
+        self._writer = Writer(out, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        self._ids: dict[Hashable, int] = {}  # of schemas and channels
+        self._attachments: set[Hashable] = set()
+        self._metadata: dict[tuple[str, str | None], dict[str, str]] = {}  # the last of each name and key
+        self._writer.start(profile="aeroloop", library=library)
+
+    def file(
+        self,
+        path: Path,
+        damages: list[Damage],
+        progress: Callable[[int], None],
+        follow: Callable[[str], Follow | None] = lambda _: lambda _: None,
+    ) -> None:
+        """Copy what a file holds. Arguments and errors are as of `records`; OSError also if it cannot be written.
+
+        `follow` is called with the topic of each channel; it returns a callback for its messages, or None to drop them.
+        """
+        schemas: dict[int, int] = {0: 0}  # of the new file, by the ids of this one
+        channels: dict[int, int] = {}
+        followers: dict[int, Follow] = {}
+
+        def chosen(channel: Channel) -> bool:
+            if (follower := follow(channel.topic)) is None:
+                return False
+            schema = schemas.get(channel.schema_id, 0)
+            channels[channel.id] = self.channel(channel.topic, channel.message_encoding, schema, channel.metadata)
+            followers[channel.id] = follower
+            return True
+
+        for record in records(path, damages, progress, chosen):
+            match record:
+                case Message(id_, log_time, data, publish_time, sequence):
+                    self.add(channels[id_], log_time, publish_time, data, sequence)
+                    followers[id_](record)
+                case Schema():
+                    schemas[record.id] = self.schema(record.name, record.encoding, record.data)
+                case Metadata(name=name, metadata=entries):
+                    if self._metadata.get(which := (name, entries.get("key"))) != entries:
+                        self._metadata[which] = entries
+                        self._writer.add_metadata(name, entries)
+                case Attachment(created, logged, name, kind, data) if (name, data) not in self._attachments:
+                    self._attachments.add((name, data))
+                    self._writer.add_attachment(created, logged, name, kind, data)
+
+    def add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int = 0) -> None:
+        """Add a message; times in ns since 1970."""
+        self._writer.add_message(channel, log_time, data, publish_time, sequence)
+        self.messages += 1
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Id of a schema in the new file."""
+        what = name, encoding, data
+        if what not in self._ids:
+            self._ids[what] = self._writer.register_schema(name, encoding, data)
+        return self._ids[what]
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str] | None = None) -> int:
+        """Id of a channel in the new file; schema 0 is none."""
+        what = topic, encoding, schema, tuple((metadata or {}).items())
+        if what not in self._ids:
+            self._ids[what] = self._writer.register_channel(topic, encoding, schema, metadata or {})
+            self.topics.add(topic)
+        return self._ids[what]
+
+    def finish(self) -> None:
+        """Write the last descriptions again, as the recorder does, and the index. Nothing more can be added."""
+        for (name, _), entries in self._metadata.items():
+            if name == DESCRIPTION_METADATA:
+                self._writer.add_metadata(name, entries)
+        self._writer.finish()

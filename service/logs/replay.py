@@ -23,10 +23,11 @@ from aeroloop.protocol.messages.trace import ENDS, End, Sent
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
+from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Array, Missing, Session, SessionKey, Source
-from aeroloop.service.logs.ticks import LoggedController, commanded, levels, rows_of
+from aeroloop.service.logs.session import Missing, Session, SessionKey, Source
+from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows, levels
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -122,7 +123,8 @@ def replay(
                 try:
                     one, words = _replay_session(recording, which, overrides, progress)
                     sessions.append(one)
-                    details.setdefault("controller", words)
+                    if words:
+                        details.setdefault("controller", words)
                 except AeroloopError as error:
                     if overrides:
                         raise
@@ -192,8 +194,8 @@ def _replay_session(
         if progress is not None:
             progress(INDEXING + (1 - INDEXING) / 2 * done)
 
-    columns = rows_of(rows, "tick", "received_as", "measurement", "sent_as", "command", progress=share)
-    for i, tick, received_as, measurement, logged_as, command in columns:
+    columns = [rows[name] for name in ("tick", "received_as", "measurement", "sent_as", "command")]
+    for i, (tick, received_as, measurement, logged_as, command) in enumerate(in_rows(columns, share)):
         logged.resume(i)
         answer = logged.answer(tick, received_as, measurement)
         if answer is not None:
@@ -209,7 +211,7 @@ def _replay_session(
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
     after, _ = commanded(session, wire, sent_as, computed)
     before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
-    square, ticks = _squares_added(after - before), int(answered.sum())
+    square, ticks = added(0.0, squares(after - before)), int(answered.sum())
     difference, details = None, list[str]()
     if differ:
         tick = int(rows["tick"][first])
@@ -232,14 +234,15 @@ def _replay_session(
         first_difference=difference,
         rms_v=sqrt(square / ticks) if ticks else None,
         max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
-        u_total_logged=_squares_added(before) * settings.loop.period,
-        u_total_computed=_squares_added(after) * settings.loop.period,
+        u_total_logged=added(0.0, squares(before)) * settings.loop.period,
+        u_total_computed=added(0.0, squares(after)) * settings.loop.period,
     ), details
 
 
 def _held_before(again: LoggedController, session: Session, first: int) -> list[str]:
     """What both ends held before a row of the controller, in words."""
-    for i, *row in rows_of(session.controller[:first], "tick", "received_as", "measurement"):
+    columns = [session.controller[name][:first] for name in ("tick", "received_as", "measurement")]
+    for i, row in enumerate(in_rows(columns)):
         again.resume(i)
         again.answer(*row)
     again.resume(first)
@@ -257,14 +260,6 @@ def _held_before(again: LoggedController, session: Session, first: int) -> list[
 
 def _text(command: bytes | str) -> str:
     return command.hex() if isinstance(command, bytes) else command
-
-
-def _squares_added(volts: Array) -> float:
-    """The sum of uᵀu over all rows, added in order: `np.sum` adds pairwise, which rounds differently."""
-    squares = np.zeros(len(volts))
-    for column in volts.T:
-        squares += column * column
-    return float(np.add.accumulate(np.append(0.0, squares))[-1])
 
 
 # ── The plant ──

@@ -37,6 +37,7 @@ from aeroloop.service.logs.in_force import InForce, Range, Segment, Unknown
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+Places = npt.NDArray[np.int32]
 Table = npt.NDArray[np.void]
 
 SessionKey = tuple[str, str]
@@ -129,9 +130,9 @@ class Session:
     missing: list[Missing]
     unknown: list[Unknown]
     k: Integers
-    at_controller: Integers
-    at_plant: Integers
-    acted: Integers
+    at_controller: Places
+    at_plant: Places
+    acted: Places
 
 
 class TraceIndex:
@@ -397,13 +398,14 @@ def table_dtype(end: End, wire: WireSpec) -> np.dtype[np.void]:
     return np.dtype([*((name, np.dtype(np.int64) if name in wide else rows[name]) for name in names), ("wall", "<i8")])
 
 
-def join(controller: Table, plant: Table, first: float = -inf, last: float = inf) -> tuple[Integers, ...]:
+def join(
+    controller: Table, plant: Table, first: float = -inf, last: float = inf
+) -> tuple[Integers, Places, Places, Places]:
     """Ticks from `first` to `last` and the rows of each: k, at_controller, at_plant and acted of `Session`."""
-    received_as = controller["received_as"]
-    computed = np.flatnonzero((received_as == Received.FRAME) | (received_as == Received.SILENT))
+    computed = np.flatnonzero(np.isin(controller["received_as"], (Received.FRAME, Received.SILENT)))
     acting = np.flatnonzero((plant["outcome"] == Outcome.ACTED) & (plant["answered"] != NO_TICK))
-    both = np.sort(np.concatenate([controller["tick"][computed], plant["session_tick"]]), kind="stable")
-    k = both[(np.diff(both, prepend=NO_TICK - 1) > 0) & (both >= first) & (both <= last)]
+    k = np.unique(np.concatenate([controller["tick"][computed], plant["session_tick"]]))
+    k = k[(k >= first) & (k <= last)]
     return (
         k,
         _places(controller["tick"][computed], computed, k),
@@ -412,10 +414,10 @@ def join(controller: Table, plant: Table, first: float = -inf, last: float = inf
     )
 
 
-def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
+def _places(ticks: Integers, places: npt.NDArray[np.intp], k: Integers) -> Places:
     """Of each tick k, where it stands first, or −1."""
     ticks, first = np.unique(ticks, return_index=True)
     if not len(ticks):
-        return np.full(len(k), -1)
+        return np.full(len(k), -1, dtype=np.int32)
     at = np.minimum(np.searchsorted(ticks, k), len(ticks) - 1)
-    return np.where(ticks[at] == k, places[first][at], -1)
+    return np.where(ticks[at] == k, places[first][at], -1).astype(np.int32)

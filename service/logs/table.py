@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.trace import NEVER
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
-from aeroloop.service.logs.session import Array
+from aeroloop.service.logs.session import Array, SessionKey
 from aeroloop.service.logs.ticks import Ticks
 
 Kind = Literal["double", "int64", "int8", "bool", "string"]
@@ -44,15 +44,6 @@ def is_of_tick(truth: Truth, actuators: int) -> bool:
     return 0 <= (truth.session_tick or 0) < NEVER and len(truth.voltages) == actuators
 
 
-class Rows(NamedTuple):
-    """Some ticks of one session, in order, with the latest truth at each; NaN before the first."""
-
-    vehicle: str
-    session: str
-    ticks: Ticks
-    truth: TruthColumns
-
-
 class Column(NamedTuple):
     """A column and its values, NaN where a double is missing. Shape (n,).
 
@@ -66,10 +57,10 @@ class Column(NamedTuple):
     kind: Kind = "double"
 
 
-def columns_of(rows: Rows, settings: Settings) -> list[Column]:
-    """Every column of the table, in order."""
+def columns_of(which: SessionKey, ticks: Ticks, truth: TruthColumns, settings: Settings) -> list[Column]:
+    """Every column of the table of some ticks of a session, with the latest truth at each; NaN before the first."""
     wire, period = settings.wire, settings.loop.period
-    ticks, truth, n = rows.ticks, rows.truth, len(rows.ticks.k)
+    n = len(ticks.k)
     motors = list(map(str, wire.motors))
     outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
     # ε as received is not known where ‖ε‖ > 1: it was scaled to unit length, with η = 0 (Remark 2)
@@ -80,8 +71,8 @@ def columns_of(rows: Rows, settings: Settings) -> list[Column]:
         Column("time_s", "s", "the law's time, k times the period", ticks.k * period),
         Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", ticks.wall_ns,
                "int64"),
-        Column("vehicle", "", "name of the vehicle", np.full(n, rows.vehicle, dtype=object), "string"),
-        Column("session", "", "name of the session", np.full(n, rows.session, dtype=object), "string"),
+        Column("vehicle", "", "name of the vehicle", np.full(n, which[0], dtype=object), "string"),
+        Column("session", "", "name of the session", np.full(n, which[1], dtype=object), "string"),
         *_attitude("", "as measured", ticks.attitude),
         *_attitude("desired_", "as desired", ticks.desired),
         *_by("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", ticks.rate, AXES),

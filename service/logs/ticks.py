@@ -8,7 +8,7 @@ again, bit for bit; after missing rows, the log has the controller's state.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
@@ -29,7 +29,7 @@ from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.evaluation import configured_gains
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.recording import Progress, ReviewError, check_memory
-from aeroloop.service.logs.session import Array, Integers, Session, Table
+from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 
 Flags = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.int16] | Array
@@ -54,7 +54,8 @@ class Ticks(NamedTuple):
         wall_ns: When its measurement was sent, on the plant's wall clock; on the controller's where the plant's rows
             are missing [ns since 1970].
         sent_ns: When it was sent, on the plant's monotonic clock; −1 where it was not [ns].
-        latency_ns: From then until the command that answers it was received, on the same clock.
+        latency_ns: From then until the command that answers it was received, on the same clock. In lockstep, where the
+            plant waits for each command, NaN as both delays.
         measurement_delay_ns: From the plant's sending to the controller's receiving (see `clock_offset`).
         command_delay_ns: From the controller's sending to the plant's receiving.
         attitude: q as measured. The other quantities of the law likewise, in its units.
@@ -87,11 +88,6 @@ class Ticks(NamedTuple):
     def desired_rate(self) -> Array:
         """ω_d in the body frame [rad/s]. Shape (n, 3)."""
         return self.rate - self.rate_error
-
-    @classmethod
-    def joined(cls, blocks: Collection[Self]) -> Self:
-        """Concatenation of blocks, at least one."""
-        return cls(*map(np.concatenate, zip(*blocks, strict=True)))
 
     def where(self, chosen: npt.NDArray[np.bool_] | Integers | slice) -> Self:
         """The ticks that a mask, index or slice selects."""
@@ -171,13 +167,13 @@ class LoggedController:
         return self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
 
 
-def rows_of(table: Table, *names: str, progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
-    """Index and some columns of each row, as Python's numbers and bytes."""
-    for begin in range(0, len(table), AT_A_TIME):
-        part = table[begin : begin + AT_A_TIME]
-        yield from zip(range(begin, begin + len(part)), *(part[name].tolist() for name in names), strict=True)
+def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
+    """The rows of some columns, as Python's numbers and bytes."""
+    size = len(columns[0])
+    for begin in range(0, size, AT_A_TIME):
+        yield from zip(*(column[begin : begin + AT_A_TIME].tolist() for column in columns), strict=True)
         if progress is not None:
-            progress((begin + len(part)) / len(table))
+            progress(min(1.0, (begin + AT_A_TIME) / size))
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -187,35 +183,44 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
         ReviewError: It takes more memory than there is.
         LawError, PluginError: As of `Controller`.
     """
-    wire, k, controller, plant = session.settings.wire, session.k, session.controller, session.plant
+    wire, controller, plant = session.settings.wire, session.controller, session.plant
     at, at_plant = session.at_controller, session.at_plant
-    check_memory(_BYTES_PER_TICK * len(k), len(k))
-    wall, sent, latency, there, back, offset_ns = _timed(session)
-    volts = _voltages(session)
-    columns, over = _computed(session, progress)
-    state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = columns
-    ticks = Ticks(
-        k, wall, sent, latency, there, back, attitude, desired, rate, attitude_error, rate_error,
-        volts, unquantized, _gains(session), state, after,
-    )  # fmt: skip
-    answered = _is(controller, at, "sent_as", Sent.FRAME, Sent.SILENT) | (session.acted >= 0)
-    until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
-    valid = ~np.isnan(attitude[:until, 0])
+    check_memory(_BYTES_PER_TICK * len(session.k), len(session.k))
     by_plant = _is(plant, at_plant, "sent_as", Sent.FRAME)
     by_controller = (at_plant < 0) & _is(controller, at, "received_as", Received.FRAME)
     frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
-    silent = answered & _is(controller, at, "sent_as", Sent.SILENT)
-    judged = ticks.where(slice(until))
+    measurements = codes_in(wire.measurement, frames)
+    commands = codes_in(wire.command, controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]])
+    del frames
+    silent = _is(controller, at, "sent_as", Sent.SILENT)
+    answered = _is(controller, at, "sent_as", Sent.FRAME) | silent | (session.acted >= 0)
+    until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
+    wall, sent, latency, there, back, offset_ns = _timed(session)
+    volts = _voltages(session)
+    columns, over = _computed(session, progress)
+    valid = ~np.isnan(columns[1][:until, 0])  # where q was measured
+    # Of most sessions all ticks are valid and answered: slices copy nothing.
+    judged = slice(until) if valid.all() else np.flatnonzero(valid)
+    if not isinstance(judged, slice):
+        for column in columns:
+            column[: len(judged)] = column[judged]
+    k, wall, sent = (column[judged] for column in (session.k, wall, sent))
+    latency, there, back, voltages = (column[judged] for column in (latency, there, back, volts))
+    state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = (c[: len(k)] for c in columns)
+    commanded_at = slice(until) if answered[:until].all() else answered
     return Recomputed(
-        ticks=judged if valid.all() else judged.where(valid),
-        answered=k[answered],
-        voltages=volts[answered],
-        missed=k[:until][over[:until]],
+        ticks=Ticks(
+            k, wall, sent, latency, there, back, attitude, desired, rate, attitude_error, rate_error,
+            voltages, unquantized, _gains(session, k), state, after,
+        ),
+        answered=session.k[commanded_at],
+        voltages=volts[commanded_at],
+        missed=session.k[:until][over[:until]],
         unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int(silent.sum())),
-        measurements=codes_in(wire.measurement, frames),
-        commands=codes_in(wire.command, controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]]),
+        measurements=measurements,
+        commands=commands,
         offset_ns=offset_ns,
-    )
+    )  # fmt: skip
 
 
 def _computed(session: Session, progress: Progress | None) -> tuple[list[Array], Flags]:
@@ -237,34 +242,33 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     without = beside.row[: ends[-1] - ends[0]].cast("B")
 
     plant, at_plant = session.plant, session.at_plant
-    framed = np.where(plant["sent_as"] == Sent.FRAME, np.arange(len(plant)), -1)
-    holds = np.maximum.accumulate(framed)  # the row whose frame has the levels of each row
+    framed = np.flatnonzero(plant["sent_as"] == Sent.FRAME).astype(np.int32)  # a silent row repeats the levels before
     over = (at_plant >= 0) & ~_is(plant, at_plant, "sent_as", Sent.NONE)
     followed = -2
 
     def compute_without(place: int) -> None:
         """Compute a tick that only the plant has, from the state that the controller had after its last one."""
         nonlocal followed
-        row, tick = int(holds[at_plant[place]]), int(session.k[place])
-        if row >= 0:
+        before, tick = int(np.searchsorted(framed, at_plant[place], side="right")), int(session.k[place])
+        if before:
             if followed != logged.controller.tick_index:
                 followed = logged.controller.tick_index
                 for name in ("q", "state_next"):
                     beside.last_valid[name][:] = last[name]
             hypothetical.change(tick)
-            beside.tick(plant["measurement"][row].tobytes(), tick)
+            beside.tick(plant["measurement"][framed[before - 1]].tobytes(), tick)
             if beside.outputs["measured"][0]:
                 at = place * row_bytes
                 memory[at + state_bytes : at + row_bytes] = without
 
-    places = np.full(len(session.controller), -1)
+    places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
     waiting = deque(np.flatnonzero(over & (session.at_controller < 0)).tolist())
     failed: list[int] = []
     used_state = bytearray(state_bytes)
-    rows = rows_of(session.controller, "tick", "received_as", "measurement", progress=progress)
-    for (i, tick, received_as, frame), place in zip(rows, _integers(places), strict=True):
+    inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
+    for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
         while waiting and session.k[waiting[0]] < tick:
             compute_without(waiting.popleft())
         logged.resume(i)
@@ -287,13 +291,8 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     return [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)], over
 
 
-def _integers(values: Integers) -> Iterator[int]:
-    for begin in range(0, len(values), AT_A_TIME):
-        yield from values[begin : begin + AT_A_TIME].tolist()
-
-
-def _gains(session: Session) -> Array:
-    """The gains in force at each tick, one beside the other. Shape (n, gains)."""
+def _gains(session: Session, k: Integers) -> Array:
+    """The gains in force at each tick k, one beside the other. Shape (n, gains)."""
     settings = session.settings
     gains = configured_gains(law_of(settings.law, settings.loop.period, settings.wire.actuators))
     changes = [change for change in session.changes if change.gains is not None]
@@ -303,7 +302,7 @@ def _gains(session: Session) -> Array:
         gains |= change.gains.named
         sets.append(list(gains.values()))
     flat = np.array([[value for gain in one for value in gain] for one in sets])
-    which = np.searchsorted([change.tick for change in changes], session.k, side="right")
+    which = np.searchsorted([change.tick for change in changes], k, side="right")
     if not len(which) or which[0] == which[-1]:  # a view of one row
         return np.broadcast_to(flat[which[0] if len(which) else 0], (len(which), flat.shape[1]))
     return np.asarray(flat[which])
@@ -409,31 +408,37 @@ def clock_offset(forward: Array, backward: Array) -> Array:
 
 
 def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, tuple[float, float]]:
-    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`."""
+    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`.
+
+    In lockstep the plant waits for each command, so no duration is a loop's.
+    """
     rows, plant, at, at_plant = session.controller, session.plant, session.at_controller, session.at_plant
     sent = _times(plant, at_plant, "sent", _is(plant, at_plant, "sent_as", Sent.FRAME))
-    acted = _times(plant, session.acted, "received", _is(plant, session.acted, "received_as", Sent.FRAME))
-    received = _times(rows, at, "received", _is(rows, at, "received_as", Received.FRAME))
-    forward, backward = _since(sent, received), _since(_times(rows, at, "sent"), acted)
-    offset = clock_offset(forward, backward)
-    known = offset[~np.isnan(offset)]
     wall = np.where(
         at_plant >= 0,
         _times(plant, at_plant, "sent") + _times(plant, at_plant, "wall"),
         _times(rows, at, "received") + _times(rows, at, "wall"),
     )
+    if session.settings.loop.lockstep:
+        unknown = np.broadcast_to(np.float64(nan), len(session.k))
+        return wall, sent, unknown, unknown, unknown, (nan, nan)
+    acted = _times(plant, session.acted, "received", _is(plant, session.acted, "received_as", Sent.FRAME))
+    received = _times(rows, at, "received", _is(rows, at, "received_as", Received.FRAME))
+    forward, backward = _since(sent, received), _since(_times(rows, at, "sent"), acted)
+    offset = clock_offset(forward, backward)
+    known = offset[~np.isnan(offset)]
     ends = (float(known[0]), float(known[-1])) if len(known) else (nan, nan)
     return wall, sent, _since(sent, acted), forward - offset, backward + offset, ends
 
 
-def _times(table: Table, at: Integers, name: str, known: Flags | None = None) -> Integers:
+def _times(table: Table, at: Places, name: str, known: Flags | None = None) -> Integers:
     """A column's values at places of a table; −1 where the place is −1 or the time is not known. Shape (n,)."""
     if not len(table):
         return np.full(len(at), -1)
     return np.where((at >= 0) if known is None else known, table[name][at], -1)
 
 
-def _is(table: Table, at: Integers, name: str, *kinds: int) -> Flags:
+def _is(table: Table, at: Places, name: str, *kinds: int) -> Flags:
     """Whether a column's value at places of a table is one of these; false where the place is −1. Shape (n,)."""
     return np.isin(table[name][at], kinds) & (at >= 0) if len(table) else np.zeros(len(at), dtype=np.bool_)
 

@@ -57,6 +57,16 @@ def message_of(
     return Said(key, published_ns, message if isinstance(message, bytes) else message.encode())
 
 
+def contents(log: Path) -> tuple[list[Said], list[tuple[str, dict[str, str]]]]:
+    """Messages of a whole log in order of time, and its metadata."""
+    with log.open("rb") as file:
+        reader = make_reader(file)
+        messages = [
+            Said(channel.topic, one.publish_time, one.data, one.log_time) for _, channel, one in reader.iter_messages()
+        ]
+        return messages, [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+
+
 def rewrite(
     log: Path,
     out: Path,
@@ -73,12 +83,7 @@ def rewrite(
         more: Messages to add, where they were recorded.
         metadata: Metadata to add, by name.
     """
-    with log.open("rb") as file:
-        reader = make_reader(file)
-        messages = [
-            Said(channel.topic, one.publish_time, one.data, one.log_time) for _, channel, one in reader.iter_messages()
-        ]
-        known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    messages, known = contents(log)
     kept = [one for message in messages if (one := change(message)) is not None]
     return write_messages(out, sorted([*kept, *more], key=lambda one: one.at_ns), [*known, *metadata])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from mcap.reader import make_reader
@@ -19,33 +18,16 @@ from aeroloop.service.review.review import review
 from aeroloop.service.viewers.channels import Decoder
 from tests.support.edited_log import Said, write_messages
 from tests.support.made_log import SESSION, VEHICLE, make_log
+from tests.support.mcap_parts import by_mcap
 
 TICKS = 400
-
-
-class Read(NamedTuple):
-    """A message as the mcap package's reader has it."""
-
-    topic: str
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: bytes
-
-
-def read(path: Path) -> list[Read]:
-    with path.open("rb") as file:
-        return [
-            Read(channel.topic, message.sequence, message.log_time, message.publish_time, message.data)
-            for _, channel, message in make_reader(file).iter_messages()
-        ]
 
 
 def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decoded(tmp_path: Path) -> None:
     """Also where the recorder has decoded some already: those are made again, not doubled."""
     log = tmp_path / "log.mcap"
     make_log(log, TICKS, settings=load())
-    raw, rng = read(log), random.Random(3)
+    raw, rng = by_mcap(log), random.Random(3)
     files = Recording([log])
     decoder = Decoder(rate_hz=10)
     for description in files.descriptions.values():
@@ -63,7 +45,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     ]
     write_messages(tmp_path / "recorded.mcap", recorded, descriptions)
     exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
-    found = read(tmp_path / "out.mcap")
+    found = by_mcap(tmp_path / "out.mcap")
     assert exported.rows == len(found)
     assert sorted((m.topic, m.log_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
         (m.topic, m.log_time, m.data) for m in raw
@@ -100,4 +82,4 @@ def test_what_several_files_repeat_is_written_once_and_the_last_description_stay
         summary = reader.get_summary()
         assert summary is not None
         assert (len(summary.schemas), len(summary.channels)) == (1, 1)
-    assert [message.sequence for message in read(tmp_path / "out.mcap")] == [0, 1, 2]
+    assert [message.sequence for message in by_mcap(tmp_path / "out.mcap")] == [0, 1, 2]

@@ -23,7 +23,7 @@ from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
-from aeroloop.service.logs.table import Rows, TruthColumns, columns_of, euler_deg
+from aeroloop.service.logs.table import TruthColumns, columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
@@ -164,8 +164,8 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
     law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
-    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros))
-    columns = columns_of(rows, load().model_copy(update={"wire": wire}))
+    ticks, truth = Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros)
+    columns = columns_of((VEHICLE, SESSION), ticks, truth, load().model_copy(update={"wire": wire}))
     found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
     np.testing.assert_equal(
         found,
@@ -307,6 +307,17 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
     assert (tmp_path / "there.csv").read_text() == "mine"
 
 
+def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Table) -> None:
+    part = ("--from", "0.3", "--until", "0.5")
+    assert execute(["log", "export", str(log), "--to", "parquet", "--out", str(tmp_path / "a.parquet"), *part]) == 0
+    table = pyarrow.parquet.read_table(tmp_path / "a.parquet").to_pydict()
+    assert table["tick"] == list(range(150, 251))
+    begin = parquet["tick"].index(150)
+    for name, column in table.items():
+        if "delay" not in name:  # the clocks' offset is fitted by what is read
+            assert column == parquet[name][begin : begin + 101], name
+
+
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
         assert execute(["log", "export", str(log), "--to", to, "--json"]) == 0
@@ -322,6 +333,6 @@ def test_the_table_has_a_column_for_each_motor_by_its_number(actuators: int, num
     one, volts, q = np.ones(1), np.ones((1, actuators)), np.ones((1, 4))
     law = q, q, q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
     k = np.arange(1)
-    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts))
-    names = {column.name for column in columns_of(rows, settings)}
+    ticks, truth = Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts)
+    names = {column.name for column in columns_of((VEHICLE, SESSION), ticks, truth, settings)}
     assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}

@@ -16,7 +16,6 @@ from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.in_force import InForce, Segment
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read
 from tests.support.made_log import SESSION, VEHICLE, Changes, Logged, lockstep, made, write
 
@@ -46,10 +45,6 @@ def without(messages: list[Logged], first: int, last: int, end: str | None = Non
     return kept
 
 
-def ticks_of(path: Path) -> Ticks:
-    return read(path).ticks
-
-
 @pytest.fixture(scope="module", params=["periodic", "on_change"])
 def whole(request: pytest.FixtureRequest) -> tuple[list[Logged], str]:
     settings = load(overrides=["loop.lockstep=true", f'wire.transmit="{request.param}"'])
@@ -63,9 +58,9 @@ def written(path: Path, messages: list[Logged], transmit: str = "periodic") -> P
 def test_a_log_that_begins_late_agrees_with_the_whole_one(whole: tuple[list[Logged], str], tmp_path: Path) -> None:
     """The operator had moved the body before the recorder came: what is configured is not what was followed."""
     messages, transmit = whole
-    truth = ticks_of(written(tmp_path / "whole.mcap", messages, transmit))
+    truth = read(written(tmp_path / "whole.mcap", messages, transmit)).ticks
     late = written(tmp_path / "late.mcap", without(messages, 0, 800), transmit)
-    known = ticks_of(late)
+    known = read(late).ticks
     first = int(known.k[0])
     assert 800 < first < 860
     since = truth.where(truth.k >= first)
@@ -87,10 +82,10 @@ def test_a_log_that_begins_late_agrees_with_the_whole_one(whole: tuple[list[Logg
 def test_what_was_in_force_before_the_first_change_that_a_late_log_has_is_unknown(tmp_path: Path) -> None:
     """The first record is of after the change, and no reader knows what was followed before it."""
     messages = made(lockstep(), TICKS, GOES_AWAY | {1000: (Gains(C2=(0.1, 0.1, 0.1)), LEVEL)})
-    truth = ticks_of(written(tmp_path / "whole.mcap", messages))
+    truth = read(written(tmp_path / "whole.mcap", messages)).ticks
     late = written(tmp_path / "late.mcap", without(messages, 0, 899))
     (unknown,) = read(late).findings.unknown
-    known = ticks_of(late)
+    known = read(late).ticks
     assert (unknown.vehicle, unknown.session, unknown.last_tick) == (VEHICLE, SESSION, known.k[0] - 1)
     assert unknown.first_tick >= 900
     assert 1000 <= known.k[0] < 1060
@@ -107,9 +102,9 @@ def test_a_change_within_a_gap_is_left_out_with_the_ticks_before_it(
     whole: tuple[list[Logged], str], tmp_path: Path
 ) -> None:
     messages, transmit = whole
-    truth = ticks_of(written(tmp_path / "whole.mcap", messages, transmit))
+    truth = read(written(tmp_path / "whole.mcap", messages, transmit)).ticks
     log = written(tmp_path / "a.mcap", without(messages, 60, 400, "controller"), transmit)
-    known = ticks_of(log)
+    known = read(log).ticks
     (unknown,) = read(log).findings.unknown
     assert 60 <= unknown.first_tick < 120
     assert unknown.last_tick == 199  # the record says that both are in force since tick 200
@@ -120,22 +115,16 @@ def test_a_change_within_a_gap_is_left_out_with_the_ticks_before_it(
     assert not replay([log]).differs
 
 
-def test_the_plants_record_stands_for_a_controller_whose_trace_is_missing(tmp_path: Path) -> None:
-    """Without it nothing is known of the reference, and there is no figure."""
-    messages = [one for one in made(lockstep(), TICKS, GOES_AWAY) if not one.key.endswith("trace/controller")]
-    log = written(tmp_path / "none.mcap", messages)
-    assert read(log).figures.z_track is None
-    (unknown,) = read(log).findings.unknown
-    assert unknown.first_tick == 0
-    assert "does not hold" in str(unknown)
-
-
 def test_without_a_record_and_a_beginning_nothing_is_known(tmp_path: Path) -> None:
-    messages = without(made(lockstep(), 480), 0, 100)  # less than a record's period
-    assert all(b'"record"' not in one.payload for one in messages)
-    log = written(tmp_path / "a.mcap", messages)
-    assert read(log).figures.z_track is None
-    assert replay([log]).unknown == read(log).findings.unknown != []
+    """The beginning of a log shorter than a record's period is missing, or all of the controller's trace."""
+    short, long = without(made(lockstep(), 480), 0, 100), made(lockstep(), TICKS, GOES_AWAY)
+    assert all(b'"record"' not in one.payload for one in short)
+    plants = [one for one in long if not one.key.endswith("trace/controller")]
+    for name, messages in (("short", short), ("plants", plants)):
+        log = written(tmp_path / f"{name}.mcap", messages)
+        findings = read(log).findings
+        assert findings.z_track is None
+        assert replay([log]).unknown == findings.unknown != []
 
 
 def test_a_second_session_has_its_own_gains_and_reference(tmp_path: Path) -> None:

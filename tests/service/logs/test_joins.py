@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from aeroloop.protocol.messages.trace import RECORD_S, ControllerRow, Outcome, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.wire.spec import WireSpec
@@ -17,9 +16,8 @@ from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.session import Missing, TraceIndex
-from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import Said, edited, rewrite, write_messages
+from tests.support.edited_log import contents, edited, rewrite, write_messages
 from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, VEHICLE, Logged, made, make_log, write
 from tests.support.rough_log import Known, rough_loop
 
@@ -31,11 +29,6 @@ def end_of(message: Logged) -> str:
     return message.key.rpartition("/")[2] if "/trace/" in message.key else ""
 
 
-def is_final(message: Logged) -> bool:
-    batch = read_batch(message.payload)
-    return batch is not None and batch.header.final
-
-
 def rows_of(message: Logged) -> int:
     batch = read_batch(message.payload)
     return 0 if batch is None else batch.header.rows
@@ -43,10 +36,6 @@ def rows_of(message: Logged) -> int:
 
 def written(path: Path, known: Known, messages: list[Logged] | None = None) -> Path:
     return write(path, known.settings, known.messages.all if messages is None else messages)
-
-
-def ticks_in(path: Path) -> Ticks:
-    return read(path).ticks
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -61,7 +50,7 @@ def test_what_was_joined_is_what_happened_and_both_ends_replay_byte_for_byte(see
     assert replayed.plant.ticks >= len(known.measured)
     assert replayed.reasons == {}
     assert replayed.complete
-    findings, ticks = read(path).findings, ticks_in(path)
+    findings, ticks = read(path).findings, read(path).ticks
     assert findings.missing == []
     answered = sorted({*(k for k, command in known.commands.items() if command is not None), *known.acted})
     assert ticks.k.tolist() == [k for k in sorted({*known.measured, *known.commands}) if k <= answered[-1]]
@@ -165,18 +154,6 @@ def test_what_a_killed_end_did_last_is_named_by_what_the_other_proves(tmp_path: 
     assert (missing.end, missing.first_tick, missing.last_tick, missing.rows) == ("plant", 600 - rows, 599, rows)
 
 
-def test_a_session_of_which_the_last_batch_is_missing_is_named(tmp_path: Path) -> None:
-    """A log of a loop that still runs: nothing is known to be missing, and nothing says that nothing is."""
-    settings = load()
-    messages = [
-        m for m in made(settings, 500) if not (b := read_batch(m.payload) if end_of(m) else None) or not b.header.final
-    ]
-    write(tmp_path / "a.mcap", settings, messages)
-    findings = read(tmp_path / "a.mcap").findings
-    assert {(gap.end, gap.last_tick) for gap in findings.missing} >= {("plant", None)}
-    assert sum(findings.missing_ticks.values()) <= 1
-
-
 def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
     settings = load()
     messages = made(settings, 500)
@@ -232,18 +209,6 @@ def test_a_row_that_is_not_what_was_done_is_found_at_either_end(tmp_path: Path) 
     assert (difference.session_tick, difference.field) == (77, "voltages")
 
 
-@pytest.mark.parametrize("end", ["plant", "controller"])
-def test_an_end_that_is_missing_for_long_costs_its_rows_and_nothing_else(end: str, tmp_path: Path) -> None:
-    """As after a recorder's cable was out: some blocks have no row of that end."""
-    settings = load()
-    messages = made(settings, 9000)
-    batches = [m for m in messages if end_of(m) == end]
-    gone = batches[3:-3]
-    write(tmp_path / "a.mcap", settings, [m for m in messages if m not in gone])
-    whole = read(tmp_path / "a.mcap").findings.missing_ticks
-    assert whole == {"controller": 0, "plant": 0} | {end: sum(map(rows_of, gone))}
-
-
 def missing_of(kept: Collection[int]) -> list[str]:
     """What is found missing where one process ran s1 (100 ticks), s2 (50) and s3 (100) and these batches were kept.
 
@@ -286,10 +251,7 @@ def test_a_log_in_the_order_in_which_a_late_recorder_received_it_reads_as_one_in
     """Topic by topic, the newest page first: rows are sorted by number, states and statuses by their sender's time."""
     made, late = tmp_path / "made.mcap", tmp_path / "late.mcap"
     make_log(made, 600, truth_every=2, changes=AN_OPERATORS_WORDS, injected={100: "rate:off", 120: None})
-    with made.open("rb") as file:
-        reader = make_reader(file)
-        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
-        metadata = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    messages, metadata = contents(made)
     by_key = {key: [one for one in messages if one.key == key] for key in sorted({one.key for one in messages})}
     pages = [said[max(0, end - 20) : end] for said in by_key.values() for end in range(len(said), 0, -20)]
     write_messages(late, [one for page in pages for one in page], metadata)

@@ -21,7 +21,7 @@ from aeroloop.service.review.compare import read_runs
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, report
 from aeroloop.service.viewers.channels import Decoder
-from tests.support.edited_log import Said, rewrite
+from tests.support.edited_log import Said, contents, rewrite
 from tests.support.every_message import MESSAGES
 from tests.support.hostile import TOKENS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, description, lockstep, make_log
@@ -188,23 +188,14 @@ def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alo
     clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its sessions are named, and as they could not be compared, the exit code is 1."""
-    ghost = [one._replace(key=one.key.replace("/aero/", "/ghost/")) for one in messages(clean) if one.topic == "trace"]
+    ghost = [
+        one._replace(key=one.key.replace("/aero/", "/ghost/")) for one in contents(clean)[0] if one.topic == "trace"
+    ]
     path = rewrite(clean, tmp_path / "a.mcap", more=ghost)
     both, good = replay([path]), replay([clean])
     assert (both.controller, both.plant) == (good.controller, good.plant)
     assert execute(["log", "replay", str(path), "--json"]) == 1
     assert "ghost" in json.dumps(json.loads(capsys.readouterr().out)["reasons"])
-
-
-def messages(path: Path) -> list[Said]:
-    found: list[Said] = []
-
-    def keep(one: Said) -> Said:
-        found.append(one)
-        return one
-
-    rewrite(path, path.with_name("unused.mcap"), keep)
-    return found
 
 
 FIELDS = {"sizes": (4, 4), "rows": (8, 4), "run": (16, 8), "first_row": (24, 8), "monotonic_ns": (32, 8)}
@@ -230,7 +221,7 @@ def test_batches_that_no_end_publishes_are_malformed_messages(
     """Of more rows than a batch has, rows that another batch has, or a session that another process claimed."""
     junk = []
     for end in ("controller", "plant"):
-        one = next(one for one in messages(clean) if one.key.endswith(f"trace/{end}") and len(one.data) > 1000)
+        one = next(one for one in contents(clean)[0] if one.key.endswith(f"trace/{end}") and len(one.data) > 1000)
         data = bytearray(one.data)
         for name, value in wrong.items():
             at, size = FIELDS[name]

@@ -16,7 +16,7 @@ from aeroloop.protocol.messages.models import Telemetry
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.service.config import load
+from aeroloop.service.config import Settings, load
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.daemon.tick_source import PlantTick
@@ -35,6 +35,7 @@ from tests.support.made_log import (
     Clock,
     ControllerEnd,
     Messages,
+    lockstep,
     make_log,
     write,
 )
@@ -89,6 +90,22 @@ def test_the_level_of_every_code_is_the_quantizers(kind: Any, width: int) -> Non
     assert bits(levels(signal, codes)) == bits(list(map(signal.quantizer().level, codes.tolist())))
 
 
+def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
+    """What was computed is what telemetry said."""
+    names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
+    at = {k: i for i, k in enumerate(ticks.k.tolist())}
+    published = 0
+    for found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
+        telemetry = Telemetry.model_validate_json(found.data)
+        i = at[telemetry.tick]
+        assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
+        assert bits(ticks.rate_error[i]) == bits(telemetry.rate_error)
+        assert bits(ticks.unquantized[i]) == bits(telemetry.voltages)
+        assert bits(ticks.state_next[i]) == bits([x for name in names for x in telemetry.state[name]])
+        published += 1
+    assert published > 40
+
+
 @pytest.mark.parametrize(
     ("kind", "wire"),
     [
@@ -103,22 +120,21 @@ def test_a_log_of_any_law_and_wire_is_computed_again_as_it_was(kind: str, wire: 
     make_log(log, 500, settings=settings, changes=changes, lost={30, 31, 300})
     assert replay([log]).controller == EndReplay(ticks=497, differ=0)
     ticks = recompute(Recording([log]).session((VEHICLE, SESSION))).ticks
-    names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
-    at = {k: i for i, k in enumerate(ticks.k.tolist())}
-    published = 0
-    for found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
-        telemetry = Telemetry.model_validate_json(found.data)
-        i = at[telemetry.tick]
-        assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
-        assert bits(ticks.rate_error[i]) == bits(telemetry.rate_error)
-        assert bits(ticks.unquantized[i]) == bits(telemetry.voltages)
-        assert bits(ticks.state_next[i]) == bits([x for name in names for x in telemetry.state[name]])
-        published += 1
-    assert published > 40
+    check_by_telemetry(ticks, log, settings)
     make_log(log, 500, settings=settings, changes={}, begin=260)
     both = replay([log])
     if both.controller is not None:
         assert both.controller.differ == 0
+
+
+def test_ticks_without_a_valid_measurement_are_left_out_of_every_column(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    make_log(log, 500, settings=lockstep(), injected={100: "rate:off", 120: None})
+    found = recompute(Recording([log]).session((VEHICLE, SESSION)))
+    assert found.ticks.k.tolist() == [k for k in range(500) if not 100 <= k < 120]
+    assert {len(column) for column in found.ticks} == {480}
+    assert not np.isnan(found.ticks.unquantized).any()
+    check_by_telemetry(found.ticks, log, lockstep())
 
 
 def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(
@@ -192,7 +208,7 @@ def test_a_log_that_takes_more_memory_than_there_is_is_refused_with_what_to_do(
     make_log(tmp_path / "a.mcap", 600)
     session = Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION))
     monkeypatch.setattr(recording_module, "available_bytes", lambda: 300_000)
-    with pytest.raises(ReviewError, match=r"600 ticks take .* GiB of memory, .* choose a part with --from and --to"):
+    with pytest.raises(ReviewError, match=r"600 ticks take .* GiB of memory, .* `aeroloop log review` reads a part"):
         recompute(session)
 
 
