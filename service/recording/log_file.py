@@ -33,7 +33,7 @@ _32_BITS: Final = 0xFFFF_FFFF
 class LogFile:
     """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created.
 
-    It is the stream of its own writer, for which `write`, `tell` and `flush` are; `size` is its bytes on the disk.
+    It is the stream that its own writer writes to; `size` is its bytes on the disk.
     """
 
     def __init__(self, path: Path) -> None:

@@ -93,14 +93,11 @@ def read(
     if part is not None and not len(its.k):
         lasts = its.extent.ticks * its.settings.loop.period
         raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
-    judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     messages = read_messages(recording, which, its.settings.wire.actuators)
     first, last = (0, max(its.extent.last.values())) if part is None else its.k[[0, -1]].tolist()
-    seen = _Seen(
-        happened(messages, its, (first, last), session is not None),
-        fault_intervals(messages, its),
-        lapses(its, judged.missed),
-    )
+    events, faults = happened(messages, its, (first, last), session is not None), fault_intervals(messages, its)
+    judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
+    seen = _Seen(events, faults, lapses(its, judged.missed))
     its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
     merits, findings, theorem = _judge(recording, its, judged, messages, seen, part)
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}

@@ -87,20 +87,19 @@ def check_theorem(
     checks, outside, judged, run = list[LemmaCheck](), dict[str, int](), 0, dict[str, Any]()
     why, undecided = "faults acted at the plant" if faults and e is not None else promised.unjudged, None
     if law is not None and e is not None and within.any():
-        sides = {one.equation: one for one in lemma.lemma_inequalities(samples, law, e.known, e.lemma)}
-        acts = np.clip(ticks.voltages, -settings.plant.voltage_limit, settings.plant.voltage_limit)
-        error = lemma.norm(acts - ticks.unquantized[:, -acts.shape[1] :])
-        refused = ~(error <= e.plant.delta_u * (1 + 1e-9) + 1e-12)  # NaN: no command
+        refused = _refused(settings, e, ticks)
         large = true[2] > np.degrees(2 * e.known.half_angle_e) * (1 + 1e-9)
-        unmet = {name: sides.pop(name).broken for name in ("C.28", "C.29")}
-        unmet |= {"C.30": refused[place], "Assumption 3": large}
-        outside = {name: int((within & where).sum()) for name, where in unmet.items()}
-        met = within & ~np.any(list(unmet.values()), axis=0)
-        checks, judged = [_lemma_check(one, met, at.k, period) for one in sides.values()], int(met.sum())
+        unmet = {"C.30": refused[place], "Assumption 3": large}
+        checks, outside, judged = _judged_lemma(
+            lemma.lemma_inequalities(samples, law, e.known, e.lemma),
+            within,
+            unmet,
+            np.asarray(at.k * period, np.float64),
+        )
         if why is None:
             own_rate = lemma.times(np.swapaxes(lemma.rotation(at.desired), 1, 2), omega_d)
             x = distance(e.plant, b, sign, theta_error, own_rate)
-            bounds = _bounds(settings, e, ticks.k, refused, np.where(ticks.k >= since, z, 0.0)).where(place)
+            bounds = _bounds(settings, e, ticks.k, refused, np.where(ticks.k >= since, z, 0.0), place)
             off = lemma.norm((samples.q_Q - samples.q)[:, 1:]), lemma.norm(samples.omega_Q - samples.omega)
             good = within & ~large & ~refused[place] & bounds.assume(*off)
             states = _States(at.k, good, true[0], true[1], x)
@@ -132,11 +131,19 @@ def check_theorem(
     return TheoremCheck(findings, _reasons(findings, promised, why, undecided), z, V, at.k, true)
 
 
-class _Bounds(NamedTuple):
-    """What is proven at each tick: k [1/s], ∫ δ dt so far [N·m], and the errors of ε and ω [1, rad/s] that both assume.
+def _refused(settings: Settings, e: Evaluated, ticks: Ticks) -> Flags:
+    """Ticks whose command is missing or not within (C.30). Shape (n,)."""
+    acts = np.clip(ticks.voltages, -settings.plant.voltage_limit, settings.plant.voltage_limit)
+    error = lemma.norm(acts - ticks.unquantized[:, -acts.shape[1] :])
+    return np.asarray(~(error <= e.plant.delta_u * (1 + 1e-9) + 1e-12))  # NaN: no command
 
+
+class _Bounds(NamedTuple):
+    """What is proven at ticks with a true state.
+
+    These are k [1/s], ∫ δ dt so far [N·m], and the errors of ε and ω [1, rad/s] that both assume.
     `failed` counts the ticks so far that are after a gap, have no command within (C.30) or no δ; `over`, as many of
-    them as do not act any more. Shapes (n,).
+    them as do not act any more. Shapes (m,).
     """
 
     rate: Array
@@ -145,10 +152,6 @@ class _Bounds(NamedTuple):
     most_omega: Array
     failed: Integers
     over: Integers
-
-    def where(self, place: Integers) -> _Bounds:
-        """Those at some ticks."""
-        return _Bounds._make(column[place] for column in self)
 
     def assume(self, eps: Array, omega: Array) -> Flags:
         """Whether errors of ε and ω are as assumed."""
@@ -166,21 +169,20 @@ class _States(NamedTuple):
     x: Array
 
 
-def _bounds(settings: Settings, e: Evaluated, k: Integers, refused: Flags, z: Array) -> _Bounds:
-    """Bounds at ticks k with this ‖z^Q‖, at some of which the command is not within (C.30). Shapes (n,)."""
+def _bounds(settings: Settings, e: Evaluated, k: Integers, refused: Flags, z: Array, place: Integers) -> _Bounds:
+    """Bounds at some places of ticks k with this ‖z^Q‖; some commands are `refused` by (C.30). Shapes (n,)."""
     period, late = settings.loop.period, _late(settings)
-
-    def decays(norms: Array) -> Array:
-        return _by_size(norms, 8, lambda size: decay(e, size) or (nan,) * 4)
-
-    before, largest = np.concatenate([np.zeros(1 + late), z]), np.maximum.accumulate(z)
-    recent = np.max([before[i : i + len(k)] for i in range(2 + late)], axis=0)
+    largest, recent = np.maximum.accumulate(z), z.copy()
+    for ticks in range(1, 2 + late):  # since the command that acts was computed
+        recent[ticks:] = np.maximum(recent[ticks:], z[:-ticks])
     lags = e.plant.age > (1 + late) * period * (1 + 1e-9)
-    delta = decays(largest if lags else recent)[1] * period
+    delta = period * _by_size(
+        largest if lags else recent, 8, lambda size: found.delta if (found := decay(e, size)) else nan
+    )
     failed = np.cumsum(refused | (np.diff(k, prepend=-1) != 1) | np.isnan(delta))
-    over = np.concatenate([np.zeros(1 + late, dtype=np.int64), failed])[: len(k)]
-    rate, _, most_eps, most_omega = decays(largest)
-    return _Bounds(rate, np.cumsum(np.nan_to_num(delta)), most_eps, most_omega, failed, over)
+    over = np.concatenate([np.zeros(1 + late, dtype=np.int64), failed])[place]
+    rate, _, most_eps, most_omega = _by_size(largest[place], 8, lambda size: decay(e, size) or (nan,) * 4)
+    return _Bounds(rate, np.cumsum(np.nan_to_num(delta))[place], most_eps, most_omega, failed[place], over)
 
 
 def _late(settings: Settings) -> int:
@@ -237,15 +239,26 @@ def _closest(statement: str, left: Array, right: Array, time: Array) -> dict[str
     return dict(zip(names, (len(left), float(share[most]), round(float(time[most]), 9)), strict=True))
 
 
-def _lemma_check(one: lemma.Inequality, judged: Flags, k: Integers, period: float) -> LemmaCheck:
-    """One inequality at the true states of ticks k that are judged. Shapes (n,)."""
-    left, right, k, broken = one.left[judged], one.right[judged], k[judged], one.broken[judged]
+def _judged_lemma(
+    inequalities: Sequence[lemma.Inequality], within: Flags, unmet: dict[str, Flags], time: Array
+) -> tuple[list[LemmaCheck], dict[str, int], int]:
+    """Checks of Lemma 1, by premise how many true states do not satisfy it, and how many satisfy all. Shapes (m,)."""
+    sides = {one.equation: one for one in inequalities}
+    unmet = {name: sides.pop(name).broken for name in ("C.28", "C.29")} | unmet
+    met = within & ~np.any(list(unmet.values()), axis=0)
+    outside = {name: int((within & where).sum()) for name, where in unmet.items()}
+    return [_lemma_check(one, met, time) for one in sides.values()], outside, int(met.sum())
+
+
+def _lemma_check(one: lemma.Inequality, judged: Flags, time: Array) -> LemmaCheck:
+    """One inequality at the true states that are judged. Shapes (m,)."""
+    left, right, time, broken = one.left[judged], one.right[judged], time[judged], one.broken[judged]
     found = LemmaCheck(equation=one.equation, what=one.what, samples=len(left), broken=int(broken.sum()))
     if not len(left):
         return found
     ratio = np.where(left > 1e-12, left / np.maximum(right, 1e-300), 0.0)
-    most, broken_s = int(np.argmax(ratio)), round(int(k[np.argmax(broken)]) * period, 9) if broken.any() else None
-    closest = {"closest": float(ratio[most]), "closest_s": round(int(k[most]) * period, 9), "broken_s": broken_s}
+    most, broken_s = int(np.argmax(ratio)), round(float(time[np.argmax(broken)]), 9) if broken.any() else None
+    closest = {"closest": float(ratio[most]), "closest_s": round(float(time[most]), 9), "broken_s": broken_s}
     return found.model_copy(update=closest)
 
 

@@ -129,11 +129,8 @@ def test_the_log_of_a_real_run(reader: Reader, tmp_path: Path) -> None:
     assert review(log).duration_s == json.loads(done.stdout)["duration_s"]
 
 
-def test_the_files_of_a_rotated_run(
-    reader: Reader, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_files_of_a_rotated_run(reader: Reader, whole: Path, tmp_path: Path) -> None:
     """Each of them alone, and together as many messages as were recorded."""
-    monkeypatch.setattr(rolling, "LOOK_S", 0.0)
     settings = RecorderSettings(path=tmp_path / "run.mcap", chunk_s=1e-9, max_file_mb=0.005)
     log = rolling.RollingLog(settings, lambda text, _: pytest.fail(text))
     with whole.open("rb") as file:
