@@ -112,6 +112,7 @@ class RollingLog:
         if now >= self._due or (at_once and self.trouble):
             self._commit()
             if not self.trouble:
+                self._due = now + self.settings.chunk_s  # whatever chunks were full meanwhile
                 self._rotate_when_due(now)
 
     def close(self, waiting: int = 0) -> None:
@@ -146,7 +147,6 @@ class RollingLog:
             self._refused(error)
             return
         self._unwritten.clear()
-        self._due = time.monotonic() + self.settings.chunk_s
         if self.trouble:
             self.trouble, self._broken = "", False
             self._report(f"recording again to {self.path}", False)

@@ -120,6 +120,17 @@ def test_a_chunk_is_closed_when_it_is_large_though_it_is_not_yet_due(
     recording.log.close()
 
 
+def test_chunks_that_are_full_before_they_are_due_put_off_no_new_file(
+    tmp_path: Path, story: EventLog, clock: Clock
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1, max_file_s=0.4)
+    small = story.messages[0]
+    large = [Arrived(small.received._replace(payload=os.urandom(CHUNK_BYTES)), small.at_ns) for _ in range(600)]
+    recording.take(large)
+    recording.log.close()
+    assert len(in_order(tmp_path)) >= 600 * TICK_S / 2 / 0.5
+
+
 # ── names and retention ──
 
 
