@@ -131,9 +131,6 @@ TOPICS: Final = {
 RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
 """Topics published from a cache."""
 
-FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.kind == "frame")
-"""Topics of frames."""
-
 _Actions = tuple[Action, ...]
 _CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer"), ("subscribe", "query")
 ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {

@@ -7,11 +7,10 @@ making and checking matrices. Through `Function.buffer()` it reads and writes pr
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from itertools import accumulate
 from math import prod
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import casadi as ca
 
@@ -28,15 +27,6 @@ def parts(memory: Buffer, sizes: Mapping[str, int]) -> dict[str, Buffer]:
     """Consecutive parts of a memory, of these sizes, by name."""
     ends = list(accumulate(sizes.values()))
     return {name: memory[end - sizes[name] : end] for name, end in zip(sizes, ends, strict=True)}
-
-
-INTEGER: Final = 1.5 * 2.0**52
-"""Added to an integer of 32 bits, it gives a double whose low half is that integer."""
-
-
-def integers(memory: Buffer) -> memoryview[int]:
-    """The integers in a memory of doubles that each are an integer plus INTEGER. `tolist` reads them all at once."""
-    return memory.cast("B").cast("i")[0 if sys.byteorder == "little" else 1 :: 2]
 
 
 class Compiled:

@@ -36,8 +36,5 @@ WIND: Final = {
 }
 """Table C.4."""
 
-SCATTER: Final = (0.088, 0.011)
-"""Standard deviation of the cells of C.2 and C.3 about their column means, as a part of these [1]."""
-
 DURATION_S: Final = 50.0
 """Length of every experiment [s]."""

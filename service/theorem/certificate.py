@@ -75,11 +75,6 @@ class Certificate(BaseModel):
     terms: list[CertificateTerm]
 
     @property
-    def blame(self) -> str | None:
-        """Why it does not hold; None where it does."""
-        return "; and ".join(self.violated) or None
-
-    @property
     def verdict(self) -> str:
         """The certificate in a sentence."""
         if self.violated:

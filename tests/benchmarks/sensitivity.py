@@ -32,6 +32,8 @@ CHANGES = {
 FITTED = "yaw Coulomb friction, N·m", "height, m", "wind about pitch, N·m", "wind about yaw, N·m", "dead zone, V"
 SCALE = np.array([0.0037, 0.0038, 0.01, 0.01, 2.5])
 KEYS = "friction.coulomb=[{p}, {}]|aero.centre_of_mass=[0, 0, {}]|wind.torque=[{}, {}]|rotor.dead_zone_v={}"
+SCATTER = 0.088, 0.011
+"""Standard deviation of the cells of C.2 and C.3 about their column means, as a part of these [1]."""
 TABLE_C4 = np.array([list(paper.WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
 
 
@@ -51,7 +53,7 @@ def main() -> None:
         published = np.array([paper.Z_TRACK, paper.U_TOTAL])  # the last of each is fitted
         errors = np.abs(np.array(calm).T[:, None] / published - 1).reshape(2, -1)[:, :-1].mean(axis=1)
         print(f"{name:34s} {errors[0]:6.1%} {errors[1]:7.2%} {np.abs(windy / TABLE_C4[3] - 1).mean():6.1%}")
-    J = ((fits[1:] - fits[0]) / TABLE_C4 / paper.SCATTER / 0.1).reshape(len(x), -1).T
+    J = ((fits[1:] - fits[0]) / TABLE_C4 / SCATTER / 0.1).reshape(len(x), -1).T
     alone, jointly = SCALE / np.linalg.norm(J, axis=0), SCALE * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     for name, value, one, both in zip(FITTED, x, alone, jointly, strict=True):
         print(f"{name:34s} {value:.3g} ± {one:.2g} if the others are known, ± {both:.2g} jointly")

@@ -10,7 +10,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.topics import FRAMES, NAME, RECORDED, ROLES, TOPICS, Address, Topic, key, read_key
+from aeroloop.protocol.messages.topics import NAME, RECORDED, ROLES, TOPICS, Address, Topic, key, read_key
 
 every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
 
@@ -43,8 +43,7 @@ def test_every_topic_has_a_name_and_a_key_of_its_own_and_is_recorded_if_it_is_pu
     assert [topic.name for topic in TOPICS.values()] == list(TOPICS)
     assert len({topic.key for topic in TOPICS.values()}) == len(TOPICS)
     published = [topic.name for topic in TOPICS.values() if topic.kind not in ("query", "token")]
-    assert sorted(RECORDED + FRAMES) == sorted(published)
-    assert FRAMES == ("measurement", "command")
+    assert sorted([*RECORDED, "measurement", "command"]) == sorted(published)
 
 
 @every_topic

@@ -6,20 +6,8 @@ from array import array
 
 import casadi as ca
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.symbolic import INTEGER, Compiled, buffer, integers, parts
-
-
-@given(st.lists(st.integers(-(2**31), 2**31 - 1), max_size=5))
-def test_integers_are_read_from_doubles(values: list[int]) -> None:
-    memory = buffer(len(values))
-    for i, value in enumerate(values):
-        memory[i] = value + INTEGER
-    read = integers(memory).tolist()
-    assert read == values
-    assert all(type(value) is int for value in read)
+from aeroloop.protocol.wire.symbolic import Compiled, buffer, parts
 
 
 def test_parts_of_a_memory_follow_each_other_and_share_it() -> None:
