@@ -18,17 +18,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, Integers, SessionKey
-from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, is_of_tick
+from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, true_state
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -173,23 +172,24 @@ def _pieces(
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
     """True states of sessions in order: tick, attitude, rate, voltages; and how many messages are malformed."""
-    actuators = {which: recording.settings(which).wire.actuators for which in chosen}
+    actuators: dict[str, dict[str, int]] = {vehicle: {} for vehicle, _ in chosen}
+    for which in chosen:
+        actuators[which[0]][which[1]] = recording.settings(which).wire.actuators
     found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
-    malformed, vehicles = 0, {vehicle for vehicle, _ in chosen}
+    malformed = 0
     for message in recording.messages(
-        lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in vehicles else None
+        lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in actuators else None
     ):
         try:
-            true = Truth.model_validate_json(message.data)
-        except ValidationError:  # a stranger may publish anything
+            true = true_state(message.data, actuators[message.answer])
+        except ValueError:
             malformed += 1
             continue
-        which = message.answer, true.session or ""
-        if which in found and not is_of_tick(true, actuators[which]):
-            malformed += 1
-        elif which in found and true.session_tick is not None:
-            found[which].append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
-    return {which: np.array(sorted(its)).reshape(-1, 8 + actuators[which]) for which, its in found.items()}, malformed
+        if true is not None and true.session is not None and true.session_tick is not None:
+            row = true.session_tick, *true.attitude, *true.rate, *true.voltages
+            found[message.answer, true.session].append(row)
+    columns = {which: 8 + actuators[which[0]][which[1]] for which in chosen}
+    return {which: np.array(sorted(its)).reshape(-1, columns[which]) for which, its in found.items()}, malformed
 
 
 def _true_at(truths: Array, k: Integers) -> TruthColumns:

@@ -6,7 +6,7 @@ that the log lacks is NaN here, and the file format's own null in a file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -39,9 +39,18 @@ class TruthColumns(NamedTuple):
     voltages: Array
 
 
-def is_of_tick(truth: Truth, actuators: int) -> bool:
-    """Whether a true state can be that of a session's tick; a stranger's may have any tick, and any plant's motors."""
-    return 0 <= (truth.session_tick or 0) < NEVER and len(truth.voltages) == actuators
+def true_state(data: bytes, actuators: Mapping[str, int]) -> Truth | None:
+    """Parse the true state of a tick of one of these sessions, by name with its number of motors; None of another.
+
+    Raises:
+        ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
+    """
+    truth = Truth.model_validate_json(data)
+    if truth.session is None or truth.session not in actuators or truth.session_tick is None:
+        return None
+    if not 0 <= truth.session_tick < NEVER or len(truth.voltages) != actuators[truth.session]:
+        raise ValueError("a true state of no tick of its session")
+    return truth
 
 
 class Column(NamedTuple):

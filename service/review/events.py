@@ -18,12 +18,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, Loss, Status, Truth
+from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, Loss, Status
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.session import Array, Integers, Session, SessionKey
-from aeroloop.service.logs.table import is_of_tick
+from aeroloop.service.logs.table import true_state
 from aeroloop.service.review.report import FaultInterval, Mark
 
 MAX_MARKS: Final = 300
@@ -77,12 +77,9 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
         name = address.topic.name
         try:
             if name == "truth":
-                truth = Truth.model_validate_json(found.data)
-                if truth.session != which[1] or truth.session_tick is None:
-                    continue
-                if not is_of_tick(truth, actuators):
-                    raise ValueError
-                states.extend((truth.session_tick, *truth.attitude, *truth.rate))
+                truth = true_state(found.data, {which[1]: actuators})
+                if truth is not None and truth.session_tick is not None:
+                    states.extend((truth.session_tick, *truth.attitude, *truth.rate))
             elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
                 known.add(identity)
                 message = _EVENTS[name].model_validate_json(found.data)
