@@ -175,7 +175,8 @@ def tune(
     """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
     settings = loop_of(config, overrides)
     check_engine(engine)
-    from aeroloop.service.lab.tune import TuneOptions, parse_winds, sheets, toml_of, tune
+    from aeroloop.service.lab.tune import sheets, toml_of, tune
+    from aeroloop.service.lab.tune_search import TuneOptions, parse_winds
     from aeroloop.service.lab.workers import open_workers
     from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.terminal.display import count_bar
