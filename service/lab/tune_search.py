@@ -27,8 +27,8 @@ from aeroloop.service.lab.law_margins import survived
 from aeroloop.service.lab.sweep import Progress
 from aeroloop.service.lab.workers import Workers, run_of, with_seed
 from aeroloop.service.theorem.any_law import certify_any
-from aeroloop.service.theorem.configured import NoTheoremError
 from aeroloop.service.theorem.extremes import BoundlessError
+from aeroloop.service.theorem.feedback import NoTheoremError
 
 MORE: Final = 1.25
 """A limit that is not given is so many times what the configured gains have."""

@@ -37,9 +37,9 @@ def certificate_sheets(
 
 def _bounds(certificate: Certificate) -> Iterator[Row]:
     for what, radius, angle in (
-        ("paper's body, root of the mean square", certificate.rms_radius, None),
         ("paper's body, at every instant", certificate.pointwise_radius, certificate.pointwise_deg),
         ("configured plant, at every instant", certificate.plant_radius, certificate.plant_deg),
+        ("the same with θ̂ as first estimated", certificate.constant_radius, None),
     ):
         shown = "not proven" if radius is None else f"{radius:.4g}"
         yield {"proven, in the end": what, "‖z‖": shown, "attitude": "" if angle is None else f"{angle:.2f}°"}

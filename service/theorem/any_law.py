@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from math import hypot
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.protocol.wording import problem
+from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_class, words_of
-from aeroloop.service.theorem.certificate import Certificate, certify
-from aeroloop.service.theorem.configured import NoTheoremError, Sections, with_theorem
-from aeroloop.service.theorem.evaluation import Evaluated, evaluate
+from aeroloop.service.theorem.certificate import Certificate, Evaluated, certify, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError
+from aeroloop.service.theorem.feedback import NoTheoremError
 
 
 class OwnCertificate(BaseModel):
@@ -28,7 +28,7 @@ class OwnCertificate(BaseModel):
     verdict: str
 
 
-def certify_any(settings: Sections, **options: Any) -> Certificate | OwnCertificate:
+def certify_any(settings: Settings, **options: Any) -> Certificate | OwnCertificate:
     """The certificate of a configuration, whatever its law.
 
     Args:
@@ -52,7 +52,7 @@ def certify_any(settings: Sections, **options: Any) -> Certificate | OwnCertific
     return certify(settings, **options)
 
 
-def described_certificate(settings: Sections) -> dict[str, Any] | None:
+def described_certificate(settings: Settings) -> dict[str, Any] | None:
     """The certificate as a controller's description carries it; None of a stream, or of a law without a theorem."""
     try:
         return certify_any(settings).model_dump(mode="json")
@@ -61,24 +61,15 @@ def described_certificate(settings: Sections) -> dict[str, Any] | None:
 
 
 class Promise(NamedTuple):
-    """The law with the gains in force, its certificate, the bounds that this is made of, and the verdict in a sentence.
+    """The law with the gains in force, its certificate, what that is made of, and the verdict in a sentence.
 
-    Of another law than the paper's only the verdict is known; of a stream of set-points the law is, too.
+    Of a law without a theorem, or a reference without bounds, only the law and the verdict are known.
     """
 
-    law: AdaptiveSettings | None
+    law: LawSettings
     certificate: Certificate | None
     bounds: Evaluated | None
     verdict: str
-
-    @property
-    def unjudged(self) -> str | None:
-        """Why no run can be judged by the bounds; None if they are proven of the configured plant."""
-        if (e := self.bounds) is None:
-            return self.verdict.rstrip(".")
-        large = hypot(*(e.bounds.theta or ())) > e.plant.k_theta
-        too_large = f"the plant's ‖θ‖ exceeds law.damping_bound = {e.plant.k_theta:g}"
-        return "; ".join(e.bounds.unproven) or (too_large if large else None)
 
     @property
     def transient_s(self) -> float:
@@ -86,32 +77,31 @@ class Promise(NamedTuple):
 
         After it an error has fallen to 5 %, but θ̃ may take much longer. Of another law, that of the paper's gains.
         """
-        law = self.law or AdaptiveSettings()
+        law = self.law if isinstance(self.law, AdaptiveSettings) else AdaptiveSettings()
         return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 
-def promise(settings: Sections, changes: Sequence[Change] = (), described: Mapping[str, Any] | None = None) -> Promise:
+def promise(settings: Settings, changes: Sequence[Change] = (), described: Mapping[str, Any] | None = None) -> Promise:
     """What is promised with these changes of gains and reference in force.
 
     `described` is the certificate in the controller's description: it counts if both are as configured.
     """
     law, reference = settings.law, settings.reference
-    own = settings.law if isinstance(settings.law, AdaptiveSettings) else None
     for change in in_force(changes):
         reference = change.reference or reference
-        if own is not None and change.gains is not None:
-            law = own = own.model_copy(update=change.gains.named)
+        if change.gains is not None:
+            law = law.model_copy(update=change.gains.named)
+    begun = settings.model_copy(update={"law": law, "reference": reference})
     try:
-        begun = with_theorem(settings.model_copy(update={"law": law, "reference": reference}))
         bounds = evaluate(begun)
     except NoTheoremError as error:
         text = str(error)
-        return Promise(None, None, None, (described or {}).get("verdict", f"{text[0].upper()}{text[1:]}."))
+        return Promise(law, None, None, (described or {}).get("verdict", f"{text[0].upper()}{text[1:]}."))
     except BoundlessError as error:
-        return Promise(own, None, None, f"Nothing is promised: {error}.")
+        return Promise(law, None, None, f"Nothing is promised: {error}.")
     certificate = None
     if (law, reference) == (settings.law, settings.reference) and described is not None:
         with suppress(ValidationError):  # of another version
             certificate = Certificate.model_validate(described)
     certificate = certificate or certify(begun)
-    return Promise(own, certificate, bounds, certificate.verdict)
+    return Promise(law, certificate, bounds, certificate.verdict)

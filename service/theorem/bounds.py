@@ -18,13 +18,14 @@ Where the paper's text cannot be evaluated as printed, it is read as follows:
 - c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
   λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
 - (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
-- Remark 5 says ‖θ̃‖ ≤ k_θ. Assumption 2 keeps θ within k_θ and the projection θ̂ within k_θ/0.95: their sum bounds θ̃.
+- Remark 5 says ‖θ̃‖ ≤ k_θ. Here k_θ is the radius of a ball around θ̂(t₀), which Assumption 2 allows as any convex set;
+  θ is within it, and the projection keeps θ̂ within k_θ/0.95 of its centre: their sum bounds θ̃.
 - k of (C.66) is the largest allowed: the margin itself.
 - (C.26) has k_ω_e = 1 + λ_max(C₁); ω_e = z₂ − C₁ε̃ gives √(1 + λ_max(C₁)²). (C.56) has λ_max(C₁) k_ω_e; since e ↦ η̃ I
   + S(ε̃) is linear and of norm ‖e‖, the difference is ½ λ_max(C₁) δ_q k_ω_e, which vanishes without quantization.
 - (C.68) does not follow: V contains θ̃, so the ball is no level set of V. What (C.77) proves is the mean square,
-  (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, so √(δ_Q/k) is the root of the mean square in the long run. `invariant`
-  has a bound at every instant.
+  (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, so √(δ_Q/k) is the root of the mean square in the long run, of a law in continuous
+  time. `invariant` has a bound at every instant, of the sampled one.
 """
 
 from __future__ import annotations
@@ -71,18 +72,14 @@ class Known:
         ),
     ]
     k_theta: Annotated[
-        float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as in the law")
+        float, Term("max ‖θ‖", "Assumption 2", "N·m·s/rad", "assumed: within law.damping_bound of law.damping_estimate")
     ]
-    k_theta_hat: Annotated[float, Term("max ‖θ̂‖", "Remark 5", "N·m·s/rad", "k_θ/0.95, by the projection")]
+    k_theta_err: Annotated[
+        float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "k_θ + k_θ/0.95: θ by Assumption 2, θ̂ by the projection")
+    ]
     k_tau_d: Annotated[
         float,
         Term("k_τ_d", "C.78", "N·m", "largest ‖τ_d‖: --disturbance, and what the plant's settings say; 0 is Theorem 1"),
-    ]
-    hold: Annotated[
-        float, Term("τ_h", "sampling", "N·m", "torque by which a command is out of date, within the invariant set")
-    ]
-    power: Annotated[
-        float, Term("P_h", "sampling", "W", "power by which the adaptation is out of date, within the set")
     ]
     omega_limit: Annotated[
         float,
@@ -116,18 +113,12 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1. The last two are None where condition (C.66) fails.
-
-    Without an invariant set what sampling adds is not bounded: a certificate has no radius then.
-    """
+    """Quantities of Theorem 1 and Corollary 1, in continuous time. The last two are None where (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
     alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
-    k_theta_err: Annotated[
-        float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "k_θ + k_θ/0.95: θ by Assumption 2, θ̂ by the projection")
-    ]
     delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q due to θ̃")]
     delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 due to θ and θ̃")]
     delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "quantization's effect as a torque")]
@@ -141,7 +132,7 @@ class Theorem:
             "√(δ_Q/k)",
             "C.68, C.79",
             "1, rad/s",
-            "root of the mean of ‖z‖² in the long run, disturbance and sampling included",
+            "root of the mean of ‖z‖² in the long run, with the disturbance, of a law in continuous time",
         ),
     ]
 
@@ -192,9 +183,8 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
     coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
     delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
-    k_theta_err = p.k_theta + p.k_theta_hat
-    delta_theta1 = k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
-    delta_theta2 = p.k_theta * p.delta_omega + k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
+    delta_theta1 = p.k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
+    delta_theta2 = p.k_theta * p.delta_omega + p.k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
     delta_V2 = (
         p.C2_max * d.delta_z2
         + d.delta_z1
@@ -206,7 +196,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
         + d.delta_Bu
     )  # (C.71)
     delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
-    delta_Qdist = delta_theta1 + p.power + (delta_V2 + p.k_tau_d + p.hold) ** 2 / (2 * c0)  # (C.80)
+    delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d) ** 2 / (2 * c0)  # (C.80)
     margin = c0 / 2 - delta_V1  # (C.66)
     holds = margin > 0
     radius = sqrt(delta_Qdist / margin) if holds else None  # (C.68), (C.79)
@@ -215,7 +205,6 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
         coriolis=coriolis,
         alpha=alpha,
         delta_V1=delta_V1,
-        k_theta_err=k_theta_err,
         delta_theta1=delta_theta1,
         delta_theta2=delta_theta2,
         delta_V2=delta_V2,

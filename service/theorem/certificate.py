@@ -1,27 +1,35 @@
 """Certificate: what is proven of a configuration, with its assumptions, and what fails.
 
-Two statements stand side by side. The mean square of (C.77) follows from condition (C.66), by the paper's own terms in
-`bounds`. A bound at every instant follows from `invariant`, for the paper's body and for the configured plant. The
-certificate holds if both are proven of the configured plant and the set lies within everything that the proof
-presumes: the wire's ranges, the voltages within reach, half a turn, the bound of the damping.
+Of every law that `feedback` knows: a bound of the error at every instant, by `invariant`, for the paper's body and for
+the configured plant. The certificate holds if the plant's set is proven and lies within all that the proof presumes:
+the wire's ranges, the voltages within reach, half a turn, the bound of the damping. Of the paper's law also condition
+(C.66) with its terms, by `bounds`: a law in continuous time, so nothing of a sampled loop is concluded from it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from functools import partial
-from math import asin, degrees, floor, hypot
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import asin, degrees, floor, hypot, inf, radians, sin, sqrt
 from typing import Any, Final, get_type_hints
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.messages.operator import Hold
-from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem
-from aeroloop.service.theorem.configured import Configured, Sections, with_theorem
-from aeroloop.service.theorem.evaluation import Evaluated, beyond, evaluate
-from aeroloop.service.theorem.invariant import Reach, reach, without_error
-from aeroloop.service.theorem.margins import largest_delay
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.config import Settings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
+from aeroloop.service.theorem.extremes import Extremes, chords, extremes, motors
+from aeroloop.service.theorem.feedback import feedback_of
+from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
+from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
+
+MOST_DELAY_S: Final = 1.0
+RESOLUTION_S: Final = 1e-5
+"""The search of the largest delay."""
 
 
 class CertificateTerm(BaseModel):
@@ -41,19 +49,15 @@ class Certificate(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    holds: bool = Field(description="whether everything below is proven of the configured plant")
-    margin: float = Field(description="c₀/2 − δ_V1 [N·m·s/rad]")
-    c0: float = Field(description="c₀, as corrected [N·m·s/rad]")
-    delta_V1: float = Field(description="δ_V1 of (C.67) [N·m·s/rad]")
-    delta_V2: float = Field(description="δ_V2 of (C.71) [N·m]")
-    delta_Q: float = Field(
-        description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance; of continuous time without a set [W]"
-    )
+    holds: bool = Field(description="whether the bound at every instant is proven of the configured plant")
+    margin: float | None = Field(description="c₀/2 − δ_V1 [N·m·s/rad]; null, as the next six, of another law")
+    c0: float | None = Field(description="c₀, as corrected [N·m·s/rad]")
+    delta_V1: float | None = Field(description="δ_V1 of (C.67) [N·m·s/rad]")
+    delta_V2: float | None = Field(description="δ_V2 of (C.71) [N·m]")
+    delta_Q: float | None = Field(description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance [W]")
     k: float | None = Field(description="the largest k of (C.66) [N·m·s/rad]; null where it fails")
-    radius: float | None = Field(description="√(δ_Q/k) of (C.79); null where (C.66) fails or no set is proven")
-    rms_radius: float | None = Field(
-        description="bounds the root of the mean of ‖z‖² in the long run: radius, or pointwise_radius if that is less "
-        "[1, rad/s]; null where radius is"
+    radius: float | None = Field(
+        description="√(δ_Q/k) of (C.79): root of the mean of ‖z‖² in the long run, in continuous time; null as k"
     )
     pointwise_radius: float | None = Field(
         description="bound of ‖z‖ at every instant, in the end, for the paper's body under this wire, law and period "
@@ -64,6 +68,9 @@ class Certificate(BaseModel):
         description="the same for the configured plant: its mechanism, lag, friction, wind, sensors and transport"
     )
     plant_deg: float | None = Field(description="the attitude error within that bound [deg]")
+    constant_radius: float | None = Field(
+        description="plant_radius if θ̂ stayed at its first value (law.kind = 'nonadaptive'); null where none is proven"
+    )
     delay_ms: float | None = Field(
         description="largest further delay of commands with which it still holds [ms]; null where it does not hold"
     )
@@ -92,12 +99,137 @@ class Certificate(BaseModel):
         return {term.symbol: term.value for term in self.terms}[symbol]
 
 
-def certify(
-    settings: Sections,
+@dataclass(frozen=True)
+class Evaluated:
+    """The quantities of a certificate, to check a run against.
+
+    Attributes:
+        desired: The reference's extremes.
+        paper: Inputs, Lemma 1 and Theorem 1 of the paper's law; None of another.
+        body: Premises of the paper's body.
+        plant: Premises of the configured plant.
+        body_reach: What the paper's body reaches; None where nothing is proven.
+        plant_reach: What the configured plant reaches; likewise.
+        bounds: What the plant does beyond the paper's equations.
+    """
+
+    desired: Extremes
+    paper: tuple[Known, Lemma, Theorem] | None
+    body: Premises
+    plant: Premises
+    body_reach: Reach | None
+    plant_reach: Reach | None
+    bounds: PlantBounds
+
+
+def evaluate(
+    settings: Settings,
     *,
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
+) -> Evaluated:
+    """The quantities of a certificate; arguments and errors as of `certify`.
+
+    The assumed attitude error is widened to that of the sets, so that no certificate contradicts itself.
+    """
+    stated = disturbance or 0.0
+    if not 0 <= stated < inf:
+        raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
+    feedback_of(settings.law)  # raises before anything is computed
+    desired = extremes(settings)
+    bounds = plant_bounds(settings, disturbance is not None)
+    if bounds.held_roll and desired.rolls:
+        bounds = replace(bounds, unproven=[*bounds.unproven, "reference: it rolls, and the plant's roll is held"])
+    body = premises(settings, desired, paper_body(settings), stated, late_s)
+    plant = premises(settings, desired, bounds, stated, late_s)
+    body_reach, plant_reach = reach(body), reach(plant)
+    paper = None
+    if isinstance(settings.law, AdaptiveSettings):
+        start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
+        angles = [radians(min(180.0, start_deg)), *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at)]
+        known = _known(settings, settings.law, desired, body, max(angles))
+        lemma = lemma_1(known)
+        paper = known, lemma, theorem_1(known, lemma)
+    return Evaluated(desired, paper, body, plant, body_reach, plant_reach, bounds)
+
+
+def premises(
+    settings: Settings, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
+) -> Premises:
+    """Premises of the invariant set.
+
+    Args:
+        settings: The configuration.
+        desired: The reference's extremes.
+        plant: What the plant does beyond the paper's equations.
+        disturbance: Further torque [N·m].
+        late_s: Further age of a command [s].
+    """
+    wire, law = settings.wire, settings.law
+    gravity = law.mass * law.gravity
+    return Premises(
+        law=feedback_of(law),
+        J=law.inertia,
+        weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
+        weight_roll=abs(law.centre_of_mass[1]) * gravity,
+        norm_B=float(np.linalg.norm(motors(settings), 2)),
+        delta_omega=_error(wire.rate, 3) + plant.delta_omega,
+        delta_u=_error(wire.voltage, wire.actuators),
+        k_omega_d=desired.rate,
+        k_omega_d_dot=desired.acceleration,
+        k_omega_d_ddot=desired.jerk,
+        axis_rate=desired.axis_rate,
+        half_angle_d=desired.half_angle,
+        delta_q=chords(desired, _error(wire.attitude, 1) + plant.delta_eps),
+        period=settings.loop.period,
+        age=plant.age + late_s,
+        k_tau_d=plant.torque + disturbance,
+        tilt=desired.tilt if plant.held_roll else None,
+        lag=plant.lag,
+        uneven=plant.uneven,
+        encoder=plant.encoder,
+    )
+
+
+def _known(settings: Settings, law: AdaptiveSettings, desired: Extremes, body: Premises, error: float) -> Known:
+    wire = settings.wire
+    return Known(
+        lambda_J=max(law.inertia),
+        weight=body.weight,
+        norm_B=body.norm_B,
+        C1_min=min(law.C1),
+        C1_max=max(law.C1),
+        C2_min=min(law.C2),
+        C2_max=max(law.C2),
+        delta_eps=_error(wire.attitude, 3),
+        delta_omega=_error(wire.rate, 3),
+        delta_u=body.delta_u,
+        k_omega_d=desired.rate,
+        k_omega_d_dot=desired.acceleration,
+        half_angle_d=desired.half_angle,
+        half_angle_e=error / 2,
+        k_theta=hypot(*law.damping_estimate) + law.damping_bound,
+        k_theta_err=body.law.theta_error,
+        k_tau_d=body.k_tau_d,
+        omega_limit=wire.rate.limit,
+        u_limit=wire.voltage.limit,
+    )
+
+
+@lru_cache(maxsize=64)
+def _error(signal: SignalSpec, elements: int) -> float:
+    """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
+    return sqrt(elements) * signal.quantizer().bound
+
+
+def certify(
+    settings: Settings,
+    *,
+    disturbance: float | None = None,
+    attitude_error_deg: float | None = None,
+    late_s: float = 0.0,
+    margins: bool = True,
 ) -> Certificate:
     """The certificate of a configuration.
 
@@ -106,76 +238,108 @@ def certify(
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
         late_s: Further age of a command, by delay or lost frames [s].
+        margins: Search delay_ms and lost_frames, too.
 
     Raises:
+        NoTheoremError: Nothing is proven of the law.
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    settings = with_theorem(settings)
-    evaluated = partial(evaluate, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
-    e = evaluated(settings)
-    t = e.theorem
-    violated = _violated(settings, e)
-
-    def fails_after(delay: float) -> bool:
-        later = evaluated(settings, late_s=late_s + delay, only_plant=True, desired=e.desired)
-        return bool(_violated(settings, later))
-
-    delay = None if violated else largest_delay(fails_after)
+    e = evaluate(settings, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
+    violated = _violated(settings, e, e.plant, e.plant_reach)
+    delay = _largest_delay(settings, e) if margins and not violated else None
+    law = e.plant.law
+    constant = (
+        reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else e.plant_reach
+    )
+    known, lemma, t = e.paper or (None, None, None)
     return Certificate(
         holds=not violated,
-        margin=t.margin,
-        c0=t.c0,
-        delta_V1=t.delta_V1,
-        delta_V2=t.delta_V2,
-        delta_Q=t.delta_Qdist,
-        k=t.k,
-        radius=t.radius,
-        rms_radius=None if t.radius is None or e.body_reach is None else min(t.radius, e.body_reach.radius),
+        **{name: getattr(t, name, None) for name in ("margin", "c0", "delta_V1", "delta_V2", "k", "radius")},
+        delta_Q=None if t is None else t.delta_Qdist,
         pointwise_radius=_radius(e.body_reach),
         pointwise_deg=_degrees(e.body_reach),
         plant_radius=_radius(e.plant_reach),
         plant_deg=_degrees(e.plant_reach),
+        constant_radius=_radius(constant),
         delay_ms=None if delay is None else floor(delay * 1e5) / 100,
         lost_frames=None if delay is None else floor(delay / settings.loop.period),
         assumptions=_assumptions(settings, e, disturbance),
         violated=violated,
-        terms=[*(term for part in (e.known, e.lemma, t) for term in _terms(part)), *_reach_terms(e.plant_reach)],
+        terms=[*(term for part in (known, lemma, t) if part for term in _terms(part)), *_reach_terms(e.plant_reach)],
     )
 
 
-def _violated(settings: Configured, e: Evaluated) -> list[str]:
+def _largest_delay(settings: Settings, e: Evaluated) -> float:
+    """The largest further age of a command with which it holds, within `RESOLUTION_S` below [s].
+
+    A command is as old as its measurement until the next one replaces it: hold + delay + frames lost · period. So one
+    bisection gives both, the largest delay and the most frames lost in a row.
+    """
+
+    def holds(delay: float) -> bool:
+        later = replace(e.plant, age=e.plant.age + delay)
+        return not _violated(settings, e, later, reach(later))
+
+    low, high = 0.0, MOST_DELAY_S
+    if holds(high):
+        return high
+    while high - low > RESOLUTION_S:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def _violated(settings: Settings, e: Evaluated, p: Premises, at: Reach | None) -> list[str]:
     """What fails, the gravest first."""
     found = list(e.bounds.unproven)
-    law = settings.law
-    if e.theorem.k is None:
-        found.append(_condition(e.lemma, e.theorem))
-    if e.bounds.theta is not None and (norm := hypot(*e.bounds.theta)) > law.damping_bound:
-        found.append(f"the plant's damping, ‖θ‖ = {norm:.3g}, exceeds law.damping_bound = {law.damping_bound:g}")
-    found += _beyond(settings, e, e.plant_reach or without_error(e.plant))
-    if e.plant_reach is None:
-        found.append(_unproven(e))
-    return found
+    if e.bounds.theta is not None:
+        away = hypot(*(a - b for a, b in zip(e.bounds.theta, p.law.centre, strict=True)))
+        if away > p.law.radius:
+            found.append(
+                f"the plant's damping is {away:.3g} N·m·s/rad from law.damping_estimate, and law.damping_bound = "
+                f"{p.law.radius:g}"
+            )
+    where = "the set" if at else "what the quantizers alone do along the reference"
+    for symbol, value, unit, most, name in beyond(settings, e.desired, p, at or without_error(p)):
+        found.append(
+            f"{name} = {most:g} {unit}".rstrip()
+            + f", and {symbol} may reach {value:.3g} {unit}".rstrip()
+            + f" by {where}"
+        )
+    return found if at else [*found, _unproven(p, e.body, e.bounds)]
 
 
-def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
-    where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
-    return [
-        f"{name} = {most:g} {unit}".rstrip() + f", and {symbol} may reach {value:.3g} {unit}".rstrip() + f" by {where}"
-        for symbol, value, unit, most, name in beyond(settings, e.desired, e.plant, at)
-    ]
+def beyond(settings: Settings, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
+    """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
+    wire = settings.wire
+    limit = min(wire.voltage.limit, settings.plant.voltage_limit, p.law.volts)
+    rate = at.axis_rate + p.delta_omega + p.encoder.ripple
+    ranges = (
+        ("|ω_k|", rate, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
+        ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
+        ("|u_k|", largest_voltage(settings, desired, at), "V", limit, "saturation: wire.voltage.limit"),
+    )
+    return [each for each in ranges if each[1] > each[3]]
 
 
-def _unproven(e: Evaluated) -> str:
+def largest_voltage(settings: Settings, desired: Extremes, at: Reach) -> float:
+    """The largest |u_k| that the law commands within a set [V]."""
+    inverse = np.linalg.inv(motors(settings))
+    return float((desired.voltages + np.linalg.norm(inverse, axis=1) * at.deviation).max())
+
+
+def _unproven(p: Premises, body: Premises, bounds: PlantBounds) -> str:
     """Which properties of the plant, removed one after the other, leave a set that is proven."""
-    p, body = e.plant, e.body
+    no_theta = p.law._replace(radius=0.0, reach=0.0, Gamma=(0.0, 0.0, 0.0))
     without: tuple[tuple[str, dict[str, Any]], ...] = (
-        (f"commands {p.age * 1e3:.3g} ms old (rotor lag, period, transport)", {"age": 0.0}),
+        (f"rotors that lag by {p.lag:.3g} s", {"lag": 0.0, "uneven": 0.0}),
+        (f"commands {p.age * 1e3:.3g} ms old", {"age": 0.0}),
         ("the held roll (u₁ is never applied)", {"tilt": None}),
-        (f"a rate sensor that errs by {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
+        ("the rate sensor's errors", {"delta_omega": body.delta_omega, "encoder": body.encoder}),
         (f"a torque of {p.k_tau_d:.2g} N·m", {"k_tau_d": body.k_tau_d}),
-        ("the attitude sensor's error", {"delta_q": body.delta_q} if e.bounds.delta_eps else {}),
-        (f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"k_theta": 0.0, "k_theta_hat": 0.0}),
+        ("the attitude sensor's error", {"delta_q": body.delta_q} if bounds.delta_eps else {}),
+        (f"‖θ̃‖ up to {p.law.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"law": no_theta}),
         ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
     )
     names = list[str]()
@@ -186,29 +350,23 @@ def _unproven(e: Evaluated) -> str:
             names.append(name)
             if reach(p) is not None:
                 break
-    return f"pointwise: no invariant set is proven with {'; with '.join(names)}"
+    return f"no invariant set is proven with {'; with '.join(names)}"
 
 
-def _condition(d: Lemma, t: Theorem) -> str:
-    parts = {"δ_ᾱ2 λ_max(J)": t.alpha, "δ_Ψ2": d.delta_Psi2, "δ_S2 λ_max(J) k_ω_d": t.coriolis}
-    symbol, value = max(parts.items(), key=lambda part: part[1])
-    return (
-        f"condition (C.66): c₀/2 = {t.c0 / 2:.4g} does not exceed δ_V1 = {t.delta_V1:.4g} N·m·s/rad; its largest term "
-        f"is {symbol} = {value:.4g}, which comes from quantization"
-    )
-
-
-def _assumptions(settings: Configured, e: Evaluated, disturbance: float | None) -> list[str]:
-    law = settings.law
-    start = degrees(2 * e.known.half_angle_e)
+def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) -> list[str]:
+    law = e.plant.law
     found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
-    torque = f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)"
+    paper = (
+        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper[0].half_angle_e):g}° (--attitude-error)"]
+        if e.paper
+        else []
+    )
     return [
-        f"‖θ‖ ≤ {law.damping_bound:g} N·m·s/rad, and θ is constant (law.damping_bound)",
-        torque,
-        f"for the mean square: the attitude error stays below {start:g}° (--attitude-error)",
-        "for the bound at every instant: a state near enough to the set, once (`log review` finds it), and for the age "
-        "of a command before",
+        f"θ is constant, within {law.radius:g} N·m·s/rad of the first estimate (law.damping_bound)",
+        f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)",
+        *paper,
+        "a state near enough to the set, once, and for the age of a command before",
+        *(["the integral in balance then"] if any(law.ki) else []),
         "the reference itself is followed: no approach to it is certified, at a start or after an operator's change",
         "the law's J, B, m and r_g are the plant's ([law])",
         *(["the attitude that it finds and holds is level (reference.attitude)"] if found else []),
@@ -227,9 +385,10 @@ _REACH: Final = {
     "eps_e": ("max ‖ε̃‖", "1", "attitude error within the configured plant's set"),
     "omega_e": ("max ‖ω_e‖", "rad/s", "rate error within it"),
     "axis_rate": ("max |ω_k| reached", "rad/s", "rate about an axis within it"),
-    "slow": ("‖w_s‖", "N·m", "slow disturbance: θ̃ along the reference"),
-    "fast": ("‖w_f‖", "N·m", "fast disturbance: quantization, age, sensors, friction, wind"),
-    "hold": ("τ_h of the plant", "N·m", "the part of it by which commands are out of date"),
+    "slow": ("‖w_s‖", "N·m", "slow torque: θ̃ along the reference"),
+    "fast": ("‖w_f‖", "N·m", "fast torque: age, friction, wind, θ̃ on the error's rate"),
+    "noise": ("‖w_q‖", "N·m", "error of the command by quantization and sensors"),
+    "hold": ("τ_h of the plant", "N·m", "the part of ‖w_f‖ by which commands are out of date"),
     "deviation": ("max ‖B u − B u_d‖", "N·m", "command beyond that of the reference"),
 }
 

@@ -15,11 +15,10 @@ import numpy as np
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Stream
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.interface import check_invertible
+from aeroloop.service.config import Settings
+from aeroloop.service.control.laws.interface import LawSettings, check_invertible
 from aeroloop.service.control.reference import Angles, Floats, Plan, turning
 from aeroloop.service.theorem.bounds import attitude_error
-from aeroloop.service.theorem.configured import Sections, with_theorem
 
 _SLACK: Final = 1.005
 """Of the samples of a quintic."""
@@ -58,14 +57,13 @@ class Extremes(NamedTuple):
     rolls: bool
 
 
-def extremes(settings: Sections) -> Extremes:
+def extremes(settings: Settings) -> Extremes:
     """The extremes of a configuration's reference from its first tick on, for the body that its law assumes.
 
     Raises:
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: B cannot be inverted.
     """
-    settings = with_theorem(settings)
     law, inverse = settings.law, np.linalg.inv(motors(settings))
     if isinstance(settings.reference, Stream):
         raise BoundlessError(
@@ -101,7 +99,7 @@ def extremes(settings: Sections) -> Extremes:
     return found
 
 
-def _products(plan: Plan, law: AdaptiveSettings) -> tuple[Floats, Floats, Floats, Floats]:
+def _products(plan: Plan, law: LawSettings) -> tuple[Floats, Floats, Floats, Floats]:
     """The products that q_d, ω_d, ω̇_d and the feedforward's torque are sums of, for `Plan.largest`. Shapes (m, 4).
 
     ω_d is a sum of an angle's rate times a unit vector that turns with roll and pitch, ω̇_d its derivative. Of ω × Jω
@@ -122,9 +120,8 @@ def _products(plan: Plan, law: AdaptiveSettings) -> tuple[Floats, Floats, Floats
     return half, rates, changes, torques
 
 
-def motors(settings: Sections) -> Floats:
+def motors(settings: Settings) -> Floats:
     """B of the motors present. Raises ValueError if it cannot be inverted. Shape (m, m)."""
-    settings = with_theorem(settings)
     # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
     if settings.wire.actuators not in (2, 3):
         raise ValueError(f"the theorem is about two or three motors, and wire.actuators is {settings.wire.actuators}")
@@ -159,7 +156,7 @@ def body_rates(angles: Angles) -> tuple[Floats, Floats]:
     return rate, acceleration
 
 
-def feedforward(angles: Angles, law: AdaptiveSettings) -> Floats:
+def feedforward(angles: Angles, law: LawSettings) -> Floats:
     """The torque that the law commands without error and with θ̂ = 0, −Ψ + J R ω̇_d of (C.22) [N·m]. Shape (n, 3)."""
     omega, omega_dot = body_rates(angles)
     roll, pitch, _ = angles.angle.T

@@ -1,94 +1,183 @@
 """Gains of the linear error equations, from a start and from bounded disturbances, by variation of constants.
 
-For ε̄' = −C₁/2 ε̄ + z̄/2 + d₁ and J z̄' = −φ (ε̄ + C₂ z̄) + d₂, of each axis, with E₁ = (1, 0) and E₂ = (0, 1/J):
-‖h x(t)‖ ≤ ‖x(t₀)‖ sup ‖h e^{As}‖ + D₁ ∫‖h e^{As} E₁‖ ds + D₂ ∫‖h e^{As} E₂‖ ds.
+The states of an axis are ε̃ and ω_e, the integral i where the law has one, and the torque y of the feedback where rotors
+lag behind it, with φ the share of the feedback's torque that acts:
+
+    ε̃' = ½ ω_e + d₁                          i' = ω_e + c ε̃ + d₄
+    J ω_e' = φ y − c ω_e − 2α d₁ + d₂        T y' = f − y + d₅,      f = −k_p ε̃ − (k_d + α − c) ω_e − k_i i
+
+without rotors y = f. A slow torque w_s beside d₂ is balanced at x = K w_s; about that point d₃ = w_s' acts instead.
+For each output h, over all axes, with the worst axis at every s and with ‖x(t₀)‖ the norm of (ε̃, z₂) there,
+
+    ‖h x(t)‖ ≤ ‖x(t₀)‖ sup ‖h e^{As} M‖ + Σ D_j ∫ ‖h e^{As} E_j‖ ds
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from math import ceil, log2
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.reference import Floats
 
-_SAMPLES: Final = 1000
-"""Times of e^{As} until it has fallen by e^{-20}; the quadrature is rounded up by `_SLACK`."""
+_STEP: Final = 0.1
+"""First step of e^{As}, in time constants of the fastest mode."""
+_BLOCK: Final = 256
+"""Steps until the step doubles, so that every mode is sampled finely while it lasts."""
 _SLACK: Final = 1.002
+"""By which trapezoids, and what lies between two steps, are rounded up."""
+_END: Final = 20.0
+"""Time constants of the slowest mode after which e^{As} counts as 0."""
+_MOST_BLOCKS: Final = 40
+
+OUTPUTS: Final = {
+    "eps": "", "omega": "", "integral": "", "z": "", "feedback": "", "applied": "", "gap": "",
+    "eps_dot": "eps", "omega_dot": "omega", "feedback_dot": "feedback",
+}  # fmt: skip
+"""Outputs, and those that are the derivative of one."""
 
 
-class Gains(NamedTuple):
-    """Gains of one output h x: from ‖x(t₀)‖, from D₁ and from D₂."""
+class Axis(NamedTuple):
+    """One axis; see the module's text. `lag` is T, 0 without rotors."""
+
+    kp: float
+    kd: float
+    alpha: float
+    ki: float
+    share: float
+    damping: float
+    J: float
+    phi: float
+    lag: float
+    bandwidth: float
+    ratio: float
+
+
+class System(NamedTuple):
+    """An axis in state space: x' = A x + E d; outputs by name, each a matrix; K of w_s; M of a start."""
+
+    A: Floats
+    E: Floats
+    outputs: dict[str, Floats]
+    K: Floats
+    M: Floats
+
+
+class Gain(NamedTuple):
+    """Gain of an output: from ‖x(t₀)‖, and from D₁ to D₅."""
 
     start: float
-    d1: float
-    d2: float
+    forced: tuple[float, ...]
+
+    def __call__(self, start: float, D: tuple[float, ...]) -> float:
+        """The largest ‖h x‖."""
+        return self.start * start + sum(gain * size for gain, size in zip(self.forced, D, strict=True))
 
 
-class Outputs(NamedTuple):
-    """Gains of ε̄, z̄, ω_e = z̄ − C₁ ε̄, the torque ε̄ + C₂ z̄, and x itself."""
+class Responses(NamedTuple):
+    """Gains of every output, and ‖·‖ of w_s for ε̃, (ε̃, z₂) and f at which it is balanced."""
 
-    eps: Gains
-    z: Gains
-    omega: Gains
-    torque: Gains
-    x: Gains
+    gains: dict[str, Gain]
+    eps: float
+    z: float
+    feedback: float
+
+
+def system(axis: Axis) -> System:
+    """The state space of an axis. Raises LinAlgError if a constant torque is not balanced."""
+    names = ["eps", "omega", *["integral"] * bool(axis.ki), *["rate", "slope"] * bool(axis.bandwidth)]
+    names += ["torque"] * bool(axis.lag)
+    unit = dict(zip(names, np.identity(len(names)), strict=True))
+    rate = unit.get("rate", unit["omega"])  # as received
+    at = {name: i for i, name in enumerate(names)}
+    damping = axis.damping if len(names) > 2 + bool(axis.ki) else 0.0  # else the law cancels it
+    f = -axis.kp * unit["eps"] - (axis.kd + axis.alpha - damping) * rate
+    if axis.ki:
+        f -= axis.ki * unit["integral"]
+    applied = unit.get("torque", f)
+    A, E = np.zeros((len(names), len(names))), np.zeros((len(names), 5))
+    A[0] = unit["omega"] / 2
+    A[1] = axis.phi * (applied - damping * unit["omega"]) / axis.J
+    E[0, 0], E[1, 0], E[1, 1] = 1.0, -2 * axis.alpha / axis.J, 1 / axis.J
+    if axis.ki:
+        A[at["integral"]], E[at["integral"], 3] = rate + axis.share * unit["eps"], 1.0
+    if axis.bandwidth:
+        A[at["rate"]] = unit["slope"]
+        A[at["slope"]] = axis.bandwidth**2 * (unit["omega"] - rate) - 2 * axis.ratio * axis.bandwidth * unit["slope"]
+    if axis.lag:
+        A[at["torque"]], E[at["torque"], 4] = (f - applied) / axis.lag, 1 / axis.lag
+    else:
+        E[1, 4] = axis.phi / axis.J
+    K: Floats = -np.linalg.solve(A, E[:, 1]) * axis.phi
+    E[:, 2] = -K
+    z = np.stack([unit["eps"], unit["omega"] + axis.share * unit["eps"]])
+    M: Floats = np.linalg.pinv(z)
+    M[2:] = 0.0
+    if axis.bandwidth:
+        M[at["rate"]] = M[1]  # the filter and the rotors in balance
+    if axis.lag:
+        M[at["torque"]] = f @ M
+    outputs = {
+        "eps": unit["eps"], "omega": unit["omega"], "integral": unit.get("integral", 0 * f), "feedback": f,
+        "applied": applied, "gap": f - applied,
+    }  # fmt: skip
+    outputs = {"z": z, **{name: row[None] for name, row in outputs.items()}}
+    return System(A, E, outputs, K, M)
 
 
 @lru_cache(maxsize=256)
-def gains_of(axes: tuple[Vector, ...], phi: float) -> Outputs | None:
-    """Gains of the outputs, of the worst axis at every time; None if an axis does not decay.
-
-    Args:
-        axes: (C₁, C₂, J) of each axis.
-        phi: φ.
-    """
-    matrices = [np.array([[-c1 / 2, 0.5], [-phi / j, -phi * c2 / j]]) for c1, c2, j in axes]
-    slowest = min(-np.linalg.eigvals(A).real.max() for A in matrices)
+def responses(axes: tuple[Axis, ...]) -> Responses | None:
+    """Gains over all axes; None if one does not decay."""
+    try:
+        systems = [system(axis) for axis in axes]
+    except np.linalg.LinAlgError:
+        return None
+    poles = [np.linalg.eigvals(one.A) for one in systems]
+    slowest, fastest = min(-each.real.max() for each in poles), max(np.abs(each).max() for each in poles)
     if slowest <= 0:
         return None
-    fastest = max(np.abs(np.linalg.eigvals(A)).max() for A in matrices)
-    s = np.append(0.0, np.geomspace(1e-4 / fastest, 20 / slowest, _SAMPLES))
-    rows = [_exponential(A, s) for A in matrices]
-    outputs = [
-        np.array([(1.0, 0.0) for _ in axes]),
-        np.array([(0.0, 1.0) for _ in axes]),
-        np.array([(-c1, 1.0) for c1, _, _ in axes]),
-        np.array([(1.0, c2) for _, c2, _ in axes]),
-    ]
-    through = [[np.einsum("k,nkl->nl", h[i], rows[i]) for i in range(len(axes))] for h in outputs]
-    inputs = [np.array([[1.0, 0.0], [0.0, 1 / j]]) for _, _, j in axes]
-
-    def gains(start: list[Floats], forced: list[Floats]) -> Gains:
-        size = np.max([np.abs(f) for f in forced], axis=0)
-        d1, d2 = np.trapezoid(size, s, axis=0) * _SLACK
-        return Gains(float(np.max(start)) * _SLACK, float(d1), float(d2))
-
-    eps, z, omega, torque = (
-        gains([np.linalg.norm(t, axis=1) for t in ts], [t @ E for t, E in zip(ts, inputs, strict=True)])
-        for ts in through
+    blocks = ceil(log2(1 + _END / slowest * fastest / _STEP / _BLOCK))
+    if blocks > _MOST_BLOCKS:
+        return None
+    s = np.append(0.0, np.cumsum(np.repeat(_STEP / fastest * 2.0 ** np.arange(blocks), _BLOCK)))
+    flows = [_flow(one.A, s) for one in systems]
+    gains = dict[str, Gain]()
+    for name, of in OUTPUTS.items():
+        rows = [one.outputs[of or name] for one in systems]
+        rates = _gain([row @ one.A @ flow for row, one, flow in zip(rows, systems, flows, strict=True)], systems, s)
+        through = np.max([np.linalg.norm(row @ one.E, axis=0) for row, one in zip(rows, systems, strict=True)], axis=0)
+        rates = Gain(rates.start, tuple(a + float(b) for a, b in zip(rates.forced, through, strict=True)))
+        if of:
+            gains[name] = Gain(rates.start, (*rates.forced, 0.0, rates.forced[4]))
+        else:
+            plain = _gain([row @ flow for row, flow in zip(rows, flows, strict=True)], systems, s)
+            gains[name] = Gain(plain.start, (*plain.forced, rates.forced[4], 0.0))
+    eps, z, feedback = (
+        max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z", "feedback")
     )
-    whole = gains(
-        [_largest_singular(X) for X in rows],
-        [np.linalg.norm(X @ E, axis=1) for X, E in zip(rows, inputs, strict=True)],
+    return Responses(gains, eps, z, feedback)
+
+
+def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Gain:
+    """The gain of outputs h e^{As} at times s, of each axis. Shapes (steps, rows, n)."""
+    start = max(
+        float(np.linalg.norm(row @ one.M, 2, axis=(1, 2)).max()) for row, one in zip(rows, systems, strict=True)
     )
-    return Outputs(eps, z, omega, torque, whole)
+    forced = [np.linalg.norm(row @ one.E, axis=1) for row, one in zip(rows, systems, strict=True)]
+    areas = np.trapezoid(np.max(forced, axis=0), s, axis=0) * _SLACK
+    return Gain(start * _SLACK, tuple(map(float, areas)))
 
 
-def _exponential(A: Floats, s: Floats) -> Floats:
-    """e^{As} of a 2 × 2 matrix, by Sylvester's formula. Shape (n, 2, 2)."""
-    mean, deviator = np.trace(A) / 2, A - np.identity(2) * np.trace(A) / 2
-    root = np.sqrt(complex(-np.linalg.det(deviator)))
-    faster, slower = np.exp((mean - root) * s), np.exp((mean + root) * s)
-    even, odd = (slower + faster) / 2, (slower - faster) / (2 * root) if root else s * slower
-    exponential: Floats = np.real(even[:, None, None] * np.identity(2) + odd[:, None, None] * deviator)
-    return exponential
-
-
-def _largest_singular(X: Floats) -> Floats:
-    """The norm of each 2 × 2 matrix. Shape (n,)."""
-    square = (X**2).sum(axis=(1, 2))
-    norm: Floats = np.sqrt((square + np.sqrt(np.maximum(0.0, square**2 - 4 * np.linalg.det(X) ** 2))) / 2)
-    return norm
+def _flow(A: Floats, s: Floats) -> Floats:
+    """e^{As} at times whose step doubles from block to block. Shape (len(s), n, n)."""
+    step, h = np.identity(len(A)), float(s[1])
+    for k in range(16, 0, -1):  # Taylor: ‖A h‖ is of the size of `_STEP`
+        step = np.identity(len(A)) + A * h / k @ step
+    flow = [np.identity(len(A))]
+    while len(flow) < len(s):
+        for _ in range(_BLOCK):
+            flow.append(step @ flow[-1])
+        step = step @ step
+    return np.array(flow)

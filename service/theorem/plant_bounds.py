@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import hypot, pi, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,10 +19,33 @@ from aeroloop.plant_emulator.model.emulated import RotorSettings
 from aeroloop.plant_emulator.model.sensors import SensorSettings
 from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
 from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats
-from aeroloop.service.theorem.configured import Configured, Sections
 
 DEVIATIONS: Final = 6
+
+
+class EncoderRate(NamedTuple):
+    """Errors of a rate that is the filtered derivative of encoders' angles; 0 of any other sensor.
+
+    Attributes:
+        bandwidth: ω_n of the filter [rad/s].
+        ratio: Its ζ [1].
+        lag: Its delay, ∫|1 − step response| [s].
+        ripple: Largest ‖ω‖ by which the encoders' steps make it err [rad/s].
+        angle: The error, as it passes the filter, of the angle whose derivative that is [rad].
+        turn: Error of the pitch by which joint rates become ω [rad].
+    """
+
+    bandwidth: float = 0.0
+    ratio: float = 0.0
+    lag: float = 0.0
+    ripple: float = 0.0
+    angle: float = 0.0
+    turn: float = 0.0
+
+
+NO_ENCODER: Final = EncoderRate()
 
 
 @dataclass(frozen=True)
@@ -30,10 +53,12 @@ class PlantBounds:
     """What a plant does beyond the paper's equations. The default is a body of which nothing else is known.
 
     Attributes:
-        age: Longest time from a measurement to the end of its command's effect [s].
+        age: Longest time from a measurement to the end of its command, before the rotors' lag [s].
+        lag: Time constant of the rotors, between that of a rise and that of a fall; 0 without [s].
+        uneven: ‖·‖ of the share of what lags by which a rotor that rises or falls errs beside that [1].
         delta_eps: Largest |ε_k| by which the attitude sensor errs [1].
-        delta_omega: Largest ‖ω‖ by which the rate sensor errs, without its lag [rad/s].
-        rate_lag: Mean delay of the rate sensor's filter [s].
+        delta_omega: Largest ‖ω‖ by which a gyro errs [rad/s].
+        encoder: Errors of a rate by encoders.
         torque: Largest torque of friction, dead zone, wind and a model that differs [N·m].
         theta: θ, if the plant's damping is known [N·m·s/rad].
         held_roll: Whether a mechanism holds the roll, so that u₁ is never applied.
@@ -42,9 +67,11 @@ class PlantBounds:
     """
 
     age: float
+    lag: float = 0.0
+    uneven: float = 0.0
     delta_eps: float = 0.0
     delta_omega: float = 0.0
-    rate_lag: float = 0.0
+    encoder: EncoderRate = NO_ENCODER
     torque: float = 0.0
     theta: Vector | None = None
     held_roll: bool = False
@@ -52,12 +79,12 @@ class PlantBounds:
     unproven: list[str] = field(default_factory=list)
 
 
-def paper_body(settings: Sections) -> PlantBounds:
+def paper_body(settings: Settings) -> PlantBounds:
     """The paper's plant: three torques, perfect sensors, no lag; commands are held for a period."""
     return PlantBounds(age=settings.loop.period)
 
 
-def plant_bounds(settings: Configured, stated: bool) -> PlantBounds:
+def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
     """The configured plant.
 
     Args:
@@ -97,8 +124,8 @@ def plant_bounds(settings: Configured, stated: bool) -> PlantBounds:
     if plant.ideal:
         return PlantBounds(age, torque=torque, theta=body.damping, held_roll=held, assumed=assumed, unproven=unproven)
 
-    if plant.rotor.present:
-        age += _rotors_age(plant.rotor, B)
+    lag, uneven = _rotors(plant.rotor, B)
+    if lag:
         assumed.append("the motors were in balance once, and the state within the set ever since (plant.rotor)")
     torque += float(np.linalg.norm(applied, 2)) * sqrt(motors) * plant.rotor.dead_zone_v
     torque += hypot(*plant.friction.coulomb)
@@ -107,21 +134,24 @@ def plant_bounds(settings: Configured, stated: bool) -> PlantBounds:
         assumed.append(f"gusts stay within {DEVIATIONS} standard deviations (plant.wind.gust)")
     return _with_sensors(
         plant.sensors,
-        settings.wire.rate.limit,
-        PlantBounds(age, torque=torque, theta=_damping(plant), held_roll=held, assumed=assumed, unproven=unproven),
+        PlantBounds(
+            age, lag, uneven, torque=torque, theta=_damping(plant), held_roll=held, assumed=assumed, unproven=unproven
+        ),
     )
 
 
-def _rotors_age(rotor: RotorSettings, B: Floats) -> float:
-    """The age of a torque by the rotors' lags [s].
+def _rotors(rotor: RotorSettings, B: Floats) -> tuple[float, float]:
+    """The rotors' lag [s], and what it errs by where a rise and a fall differ, as a share of a torque's lagging part.
 
-    A motor that lags by K(t) errs by ∫ w(s) u̇(t − s) ds with e^{−s/K₁} ≤ w(s) ≤ e^{−s/K₂}, K₁ the smaller lag. So the
-    torque errs by K₁ of its largest rate, and by K₂ − K₁ times the norm of B D B⁻¹, which for 0 ≤ D ≤ I is largest
-    where D has 0s and 1s alone, and 1 only if B is orthogonal or diagonal.
+    V̇ = (u − V)/T(t) with either lag is (1 + e)(u − V)/T with the harmonic mean T and |e| ≤ |T₁ − T₂|/(T₁ + T₂). Each
+    motor has its own e: of the torques it is B diag(e) B⁻¹, largest where all |e| are.
     """
-    low, high = sorted((rotor.lag_up_s, rotor.lag_down_s))
-    some = (np.diag(each) for each in product((0.0, 1.0), repeat=len(B)))
-    return low + (high - low) * max(float(np.linalg.norm(B @ D @ np.linalg.inv(B), 2)) for D in some)
+    up, down = rotor.lag_up_s, rotor.lag_down_s
+    if not rotor.present:
+        return 0.0, 0.0
+    signs = (np.diag(each) for each in product((-1.0, 1.0), repeat=len(B)))
+    most = max(float(np.linalg.norm(B @ sign @ np.linalg.inv(B), 2)) for sign in signs)
+    return 2 * up * down / (up + down), abs(up - down) / (up + down) * most
 
 
 def _damping(plant: PlantSettings) -> Vector:
@@ -135,29 +165,34 @@ def _damping(plant: PlantSettings) -> Vector:
     return x + a, y + b, z + c
 
 
-def _with_sensors(sensors: SensorSettings, rate_limit: float, plant: PlantBounds) -> PlantBounds:
-    delta_eps = delta_omega = rate_lag = 0.0
+def _with_sensors(sensors: SensorSettings, plant: PlantBounds) -> PlantBounds:
     steps = hypot(*(2 * pi / counts for counts in sensors.counts))
-    assumed = list(plant.assumed)
-    if sensors.attitude == "encoders":
-        delta_eps = steps / 2
+    delta_eps = steps / 2 if sensors.attitude == "encoders" else 0.0
+    delta_omega, encoder, assumed = 0.0, EncoderRate(), list(plant.assumed)
     if sensors.rate == "derivative":
-        ripple, rate_lag = _filter(sensors.bandwidth, sensors.damping_ratio)
-        # The pitch by which joint rates become ω errs by a step, and the yaw's rate is within the wire's range.
-        delta_omega = steps * ripple + 2 * pi / sensors.counts[0] * sqrt(2) * rate_limit
-        assumed.append("the state was within the set for as long as the rate's filter lasts (plant.sensors.bandwidth)")
+        of, ratio = sensors.bandwidth, sensors.damping_ratio
+        variation, passed, lag = _filter(of, ratio)
+        turn = 2 * pi / sensors.counts[0] * sqrt(2)
+        encoder = EncoderRate(of, ratio, lag, ripple=steps * variation, angle=steps / 2 * passed, turn=turn)
+        assumed.append("the rate's filter was in balance once, and the state within the set ever since (plant.sensors)")
     elif sensors.rate == "gyro":
         delta_omega = hypot(*sensors.gyro_bias) + sqrt(3) * DEVIATIONS * sensors.gyro_noise
         if sensors.gyro_noise:
             assumed.append(f"the gyro's noise stays within {DEVIATIONS} standard deviations (plant.sensors.gyro_noise)")
-    return replace(plant, delta_eps=delta_eps, delta_omega=delta_omega, rate_lag=rate_lag, assumed=assumed)
+    return replace(plant, delta_eps=delta_eps, delta_omega=delta_omega, encoder=encoder, assumed=assumed)
 
 
-def _filter(omega_n: float, zeta: float) -> tuple[float, float]:
-    """Of ω_n² s/(s² + 2ζω_n s + ω_n²): its output for an input that varies by 1 [1/s], its ∫|1 − step| [s]."""
+def _filter(omega_n: float, zeta: float) -> tuple[float, float, float]:
+    """Of ω_n²/(s² + 2ζω_n s + ω_n²), three figures for the errors of a rate.
+
+    Returns:
+        The largest rate of its output for an input that varies by 1 [1/s], its output for an input within ±1 [1], and
+        ∫|1 − step response| [s].
+    """
     t = np.linspace(0, 40 / (zeta * omega_n), 40_000)
     ringing = omega_n * sqrt(1 - zeta**2)
     decay = np.exp(-zeta * omega_n * t)
     rate = omega_n**2 / ringing * decay * np.sin(ringing * t)  # of a step of the angle
     settled = decay * (np.cos(ringing * t) + zeta * omega_n / ringing * np.sin(ringing * t))  # 1 − step response
-    return float(np.abs(np.diff(rate)).sum()) / 2, float(np.trapezoid(np.abs(settled), t))
+    variation = float(np.abs(np.diff(rate)).sum()) / 2
+    return variation, float(np.trapezoid(np.abs(rate), t)), float(np.trapezoid(np.abs(settled), t))

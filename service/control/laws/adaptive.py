@@ -25,17 +25,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot
 from typing import Annotated, ClassVar, Final, Literal
 
 import casadi as ca
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import (
     MAX_GAIN,
+    EstimateSettings,
     ExpressionLaw,
-    LawSettings,
     Now,
     Vector,
     check_allocation,
@@ -57,27 +56,13 @@ MatrixGain = Annotated[Vector, AfterValidator(_gain)]
 """The diagonal of a positive definite gain matrix."""
 
 
-class AdaptiveSettings(LawSettings):
+class AdaptiveSettings(EstimateSettings):
     """Model of the plant and gains of the law. The default is the paper's experiment, Table C.1."""
 
     kind: Literal["adaptive"] = Field(default="adaptive", description="which law")
     C1: MatrixGain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
     C2: MatrixGain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
     Gamma: MatrixGain = Field(default=(0.02, 0.02, 0.02), description="adaptation gain [N·m·s²/rad² per s]")
-    damping_estimate: Vector = Field(
-        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
-    )
-    damping_bound: float = Field(
-        default=0.05,
-        gt=0,
-        description="k_θ: ‖θ‖ is assumed to be below this, and ‖θ̂‖ is kept below k_θ/0.95 [N·m·s/rad]",
-    )
-
-    @model_validator(mode="after")
-    def _estimate_within_bound(self) -> AdaptiveSettings:
-        if hypot(*self.damping_estimate) > self.damping_bound:
-            raise ValueError(f"the first damping estimate lies beyond damping_bound, {self.damping_bound}")
-        return self
 
 
 @dataclass(frozen=True)
@@ -157,29 +142,30 @@ def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX
         actuators,
     )  # (C.22), (C.37)
     tau = Gamma @ Phi @ z2  # (C.23)
-    theta_dot = projection(tau, theta, Gamma, p.damping_bound)  # (C.38)
+    theta_dot = projection(tau, theta - ca.SX(p.damping_estimate), Gamma, p.damping_bound)  # (C.38)
 
     found = {"eta_e": eta_e, "eps_e": eps_e, "omega_e": omega_e, "z1": z1, "z2": z2, "u": u}
     return Equations(**given, **found, tau=tau, theta_dot=theta_dot)
 
 
-def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
+def projection(tau: ca.SX, moved: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
     """Proj{τ} of (C.38): the smooth projection of Krstić, Kanellakopoulos and Kokotović (Remark 5).
 
-    For ‖θ̂‖ ≤ k_θ it is τ itself; from there to k_θ/0.95 a growing share of the outward component is removed. So
-    −θ̃ᵀΓ⁻¹Proj{τ} ≤ −θ̃ᵀΓ⁻¹τ for every ‖θ‖ ≤ k_θ: what is removed is along Γθ̂, and θ̃ᵀθ̂ = θᵀθ̂ − ‖θ̂‖² < 0 where any is.
+    The convex set of Assumption 2 is the ball of radius k_θ around θ̂(t₀). Within it Proj{τ} is τ itself; from there to
+    k_θ/0.95 a growing share of the outward component is removed. So −θ̃ᵀΓ⁻¹Proj{τ} ≤ −θ̃ᵀΓ⁻¹τ for every θ in the ball:
+    what is removed is along Γ(θ̂ − θ̂(t₀)), and θ̃ᵀ(θ̂ − θ̂(t₀)) < 0 where any is.
 
     Args:
         tau: Γ Φ z₂, the update without projection. Shape (3,).
-        theta: θ̂. Shape (3,).
+        moved: θ̂ − θ̂(t₀). Shape (3,).
         Gamma: Adaptation gain. Shape (3, 3).
         bound: k_θ [N·m·s/rad].
     """
     outer = ESTIMATE_REACH * bound
-    outside = (ca.dot(theta, theta) - bound**2) / (outer**2 - bound**2)
-    outward = ca.dot(theta, tau)
-    weight = ca.fmin(1, outside) / ca.fmax(ca.dot(theta, Gamma @ theta), 1e-300)
-    return tau - ca.if_else(ca.logic_and(outside > 0, outward > 0), weight * outward, 0) * Gamma @ theta
+    outside = (ca.dot(moved, moved) - bound**2) / (outer**2 - bound**2)
+    outward = ca.dot(moved, tau)
+    weight = ca.fmin(1, outside) / ca.fmax(ca.dot(moved, Gamma @ moved), 1e-300)
+    return tau - ca.if_else(ca.logic_and(outside > 0, outward > 0), weight * outward, 0) * Gamma @ moved
 
 
 class Adaptive(ExpressionLaw[AdaptiveSettings]):
@@ -205,5 +191,6 @@ class Adaptive(ExpressionLaw[AdaptiveSettings]):
         law = equations(self.settings, self.actuators, given)
         theta_next = theta + self.period * law.theta_dot
         # Euler's step leaves the outer ball along its tangent; the projection keeps θ̂ within in continuous time only.
-        theta_next *= ca.fmin(1, ESTIMATE_REACH * bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
+        moved = theta_next - ca.SX(self.settings.damping_estimate)
+        theta_next -= ca.fmax(0, 1 - ESTIMATE_REACH * bound / ca.fmax(ca.norm_2(moved), 1e-300)) * moved
         return law.u, {"damping_estimate": theta_next, "sign": s}

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from math import hypot
 from typing import ClassVar, Final, Literal, TypeVar
 
 import casadi as ca
@@ -39,10 +38,10 @@ from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
 from aeroloop.service.control.laws.interface import (
     Diagonal,
+    EstimateSettings,
     ExpressionLaw,
     Floats,
     Gains3,
-    LawSettings,
     Now,
     Vector,
     check_allocation,
@@ -54,12 +53,9 @@ from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, VOLTAGE_LIMI
 _PD, _PID, _SLIDING, _LQR = (tuned(kind, PAPER_BODY, PAPER) for kind in ("pd", "pid", "sliding", "lqr"))
 
 
-class TrackingSettings(LawSettings):
+class TrackingSettings(EstimateSettings):
     """Model of the plant, a damping estimate that stays, and when the nearer of two equilibria is chosen anew."""
 
-    damping_estimate: Vector = Field(
-        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
-    )
     hysteresis: float = Field(
         default=0.4, ge=0, lt=1, description="the other equilibrium is approached from |η̃| beyond this on [1]"
     )
@@ -299,15 +295,12 @@ def riccati(A: Floats, G: Floats, Q: Floats) -> Floats:
 # ── the paper's law without adaptation ──
 
 
-class NonadaptiveSettings(LawSettings):
+class NonadaptiveSettings(EstimateSettings):
     """Model of the plant, known damping included, and gains of the law. The default is Table C.1."""
 
     kind: Literal["nonadaptive"] = Field(default="nonadaptive", description="which law")
     C1: MatrixGain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
     C2: MatrixGain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
-    damping_estimate: Vector = Field(
-        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
-    )
 
 
 class Nonadaptive(ExpressionLaw[NonadaptiveSettings]):
@@ -321,9 +314,7 @@ class Nonadaptive(ExpressionLaw[NonadaptiveSettings]):
 
     def __init__(self, settings: NonadaptiveSettings, period: float, actuators: int) -> None:
         super().__init__(settings, period, actuators)
-        same = settings.model_dump(exclude={"kind"})
-        bound = 2 * hypot(*settings.damping_estimate) or 1.0  # anything above: nothing is projected
-        self._adaptive = Adaptive(AdaptiveSettings(**same, damping_bound=bound), period, actuators)
+        self._adaptive = Adaptive(AdaptiveSettings(**settings.model_dump(exclude={"kind"})), period, actuators)
 
     def initial(self) -> Mapping[str, Sequence[float]]:
         """No sign yet."""

@@ -70,6 +70,20 @@ class LawSettings(BaseModel):
     )
 
 
+class EstimateSettings(LawSettings):
+    """Model of the plant, and what is known of its damping: its first estimate, and a ball around that."""
+
+    damping_estimate: Vector = Field(
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
+    )
+    damping_bound: float = Field(
+        default=0.03,
+        gt=0,
+        description="k_θ: ‖θ − θ̂(t0)‖ is assumed to be below this, and a law that adapts keeps ‖θ̂ − θ̂(t0)‖ below "
+        "k_θ/0.95 [N·m·s/rad]",
+    )
+
+
 class Now(NamedTuple, Generic[X]):
     """What a law computes a tick from, as CasADi columns or as arrays.
 

@@ -1,0 +1,109 @@
+"""Feedback: a law near its reference, as the error equations of `invariant` see it.
+
+Near the equilibrium e = [1, 0], with the true state, every law here commands, beyond what the model needs to follow the
+reference,
+
+    diag(ω) θ̂  −  k_p ε̃  −  (k_d + α) ω_e  −  α ((η̃ − 1) I + S(ε̃)) ω_e  −  k_i ∫(ω_e + c ε̃)
+
+- the paper's law (C.22): z₂ = ω_e + C₁ε̃ and ᾱ = −½ C₁ (η̃ I + S(ε̃)) ω_e make k_p = I + C₁C₂, k_d = C₂, α = ½ J C₁;
+- without adaptation θ̂ stays at its first value, the centre of the ball that holds θ;
+- PD and PID: their own gains, α = 0.
+
+c of a law without an integral is C₁, or 0: the share of ε̃ in z₂.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import hypot, inf
+from typing import NamedTuple
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.service.control.laws.adaptive import ESTIMATE_REACH, AdaptiveSettings
+from aeroloop.service.control.laws.baselines import NonadaptiveSettings, PDSettings, PIDSettings
+from aeroloop.service.control.laws.interface import LawSettings
+
+_NONE: Vector = (0.0, 0.0, 0.0)
+
+
+class NoTheoremError(AeroloopError):
+    """Nothing is proven of a configuration's law; one line."""
+
+
+class Feedback(NamedTuple):
+    """A law near its reference; vectors are diagonals.
+
+    Attributes:
+        kp: Gain of ε̃ [N·m].
+        kd: Gain of ω_e, without α [N·m·s/rad].
+        alpha: α, part of the gain of ω_e that acts through (η̃ I + S(ε̃)) [N·m·s/rad].
+        ki: Gain of the integral [N·m/rad]; 0 where there is none.
+        share: c, of ε̃ in z₂ = ω_e + c ε̃ and in the integral [1/s].
+        centre: θ̂(t₀), the centre of the ball that holds θ [N·m·s/rad].
+        radius: k_θ, the radius of that ball [N·m·s/rad].
+        reach: Largest ‖θ̂ − θ̂(t₀)‖: k_θ/0.95 by the projection, 0 where nothing adapts [N·m·s/rad].
+        Gamma: Adaptation gain; 0 where nothing adapts.
+        volts: |u| from which the law itself saturates [V].
+    """
+
+    kp: Vector
+    kd: Vector
+    alpha: Vector
+    ki: Vector
+    share: Vector
+    centre: Vector
+    radius: float
+    reach: float
+    Gamma: Vector
+    volts: float = inf
+
+    @property
+    def theta_error(self) -> float:
+        """Largest ‖θ̃‖ [N·m·s/rad]."""
+        return self.radius + self.reach
+
+    @property
+    def estimate(self) -> float:
+        """Largest ‖θ̂‖ [N·m·s/rad]."""
+        return hypot(*self.centre) + self.reach
+
+
+def feedback_of(law: LawSettings) -> Feedback:
+    """The feedback of a law's settings. Raises NoTheoremError for a law of which nothing is proven."""
+    if {len(row) for row in law.allocation} != {3}:
+        raise NoTheoremError("no theorem for this vehicle, whose law.allocation is not 3 × 3")
+    match law:
+        case AdaptiveSettings() | NonadaptiveSettings():
+            adapts = isinstance(law, AdaptiveSettings)
+            return Feedback(
+                kp=_each(lambda c1, c2: 1 + c1 * c2, law.C1, law.C2),
+                kd=law.C2,
+                alpha=_each(lambda j, c1: j * c1 / 2, law.inertia, law.C1),
+                ki=_NONE,
+                share=law.C1,
+                centre=law.damping_estimate,
+                radius=law.damping_bound,
+                reach=law.damping_bound * ESTIMATE_REACH if adapts else 0.0,
+                Gamma=law.Gamma if isinstance(law, AdaptiveSettings) else _NONE,
+            )
+        case PDSettings() | PIDSettings():
+            pid = law if isinstance(law, PIDSettings) else None
+            return Feedback(
+                kp=law.kp,
+                kd=law.kd,
+                alpha=_NONE,
+                ki=pid.ki if pid else _NONE,
+                share=pid.attitude_share if pid else _NONE,
+                centre=law.damping_estimate,
+                radius=law.damping_bound,
+                reach=0.0,
+                Gamma=_NONE,
+                volts=pid.voltage_limit if pid else inf,
+            )
+    raise NoTheoremError(f"no theorem for this law, {law.kind}")
+
+
+def _each(of: Callable[[float, float], float], first: Vector, second: Vector) -> Vector:
+    a, b, c = (of(x, y) for x, y in zip(first, second, strict=True))
+    return a, b, c
