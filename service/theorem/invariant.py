@@ -84,12 +84,12 @@ class Premises:
         """Each axis that differs; with a held roll x and z mix, and their means stand for both."""
         law = self.law
         gains = np.array([law.kp, law.kd, law.alpha, law.ki, law.share, law.centre, self.J]).T.tolist()
+        if self.tilt is not None:
+            x, y, z = gains
+            gains = [y, [*((a + b) / 2 for a, b in zip(x[:-1], z[:-1], strict=True)), max(self.J)]]
         late = self.lag, self.encoder.bandwidth, self.encoder.ratio
-        if self.tilt is None:
-            return tuple(dict.fromkeys(Axis(*gain, 1.0, *late) for gain in gains))
-        x, y, z = gains
-        mean = [(a + b) / 2 for a, b in zip(x, z, strict=True)]
-        return Axis(*y, 1.0, *late), Axis(*mean[:-1], max(self.J), self.phi, *late)
+        shares = [1.0, self.phi, 1.0] if self.tilt is not None else [1.0] * 3
+        return tuple(dict.fromkeys(Axis(*[*gain, share, *late]) for gain, share in zip(gains, shares, strict=False)))
 
     @property
     def phi(self) -> float:
@@ -226,7 +226,8 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     delta_q = p.delta_q(asin(eps_e))
     delta_R = 2 * delta_q
     delta_omega = p.delta_omega + p.encoder.turn * omega
-    delta_omega += p.encoder.lag * (p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega)
+    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega)
+    filtered = p.encoder.lag * omega_e_dot  # what the linear equations have of the filter only for k_d, c and θ̂(t₀)
     delta_omega_e = delta_omega + delta_R * p.k_omega_d
     if len(set(law.kp)) == len(set(law.kd)) == 1:  # parts of one error at right angles to each other
         of_state = delta_q * hypot(kp, kp * eps_e + 2 * kd * p.k_omega_d)
@@ -240,11 +241,13 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         + j * ((omega * delta_R + delta_omega) * p.k_omega_d + delta_R * p.k_omega_d_dot)
         + alpha * (delta_omega_e + delta_q * omega_e)  # ᾱ
         + p.norm_B * p.delta_u
+        + (law.reach + j * p.k_omega_d + 2 * spread * omega + alpha * zeta) * (filtered + p.encoder.ripple)
     )  # fmt: skip
 
     late = p.lag > 0 or p.encoder.bandwidth > 0  # then the linear equations have θ̂(t₀)
     # A command is old: its feedback by the age, the rest of it by the rotors' lag, too.
-    theta_dot = max(law.Gamma) * (axis_omega + delta_omega) * (z2 + delta_omega_e + share * delta_q)
+    errs = delta_omega + filtered + p.encoder.ripple
+    theta_dot = max(law.Gamma) * (axis_omega + errs) * (z2 + errs + delta_R * p.k_omega_d + share * delta_q)
     theta_dot *= sqrt(max(law.Gamma) / min(law.Gamma)) if theta_dot else 1.0  # the projection's norm
     rest_dot = (
         (law.reach if late else law.estimate) * omega_dot + theta_dot * axis_omega
@@ -255,7 +258,8 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         + alpha * (zeta * omega_e_dot + omega_e**2 / 2)
     )  # fmt: skip
     hold = p.age * at["feedback_dot"] + (p.age + p.lag) * rest_dot
-    fast = hold + law.theta_error * turned + p.k_tau_d
+    steady = kd + alpha + hypot(*law.centre)  # gain of the rate that stays, so that encoders' ripple passes as an angle
+    fast = law.theta_error * turned + p.k_tau_d
 
     # What drives the linear equations.
     push_dot = law.theta_error * p.k_omega_d_dot + p.axis_rate * theta_dot
@@ -263,17 +267,16 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     if p.tilt is not None:
         fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
     d4 = delta_omega_e + share * delta_q + p.period * (omega_e_dot + share * at["eps_dot"])
-    d5 = noise + p.uneven * (at["gap"] + p.lag * rest_dot + 2 * noise)
-    gain = kd + law.estimate + j * p.k_omega_d + 2 * spread * omega + alpha
-    d6, d7 = gain * p.encoder.angle * (1 + p.uneven), gain * p.encoder.ripple * (1 + p.uneven)
+    gap = at["gap"] + p.lag * rest_dot + 2 * (noise + steady * p.encoder.ripple)
+    d5 = noise + ki * p.encoder.angle + hold + p.uneven * gap
     deviation = (
-        at["feedback"] + slow + noise + law.estimate * axis_omega + p.weight * 2 * eps_e
+        at["feedback"] + slow + noise + steady * p.encoder.ripple + law.estimate * axis_omega + p.weight * 2 * eps_e
         + j * (omega_e * p.k_omega_d + 2 * eps_e * p.k_omega_d_dot) + alpha * zeta * omega_e
         + spread * omega**2
     )  # fmt: skip
     size = linear.z * slow + at["z"]
     return Reach(
-        D=(d1, d2, push_dot, d4 if ki else 0.0, d5, d6, d7),
+        D=(d1, d2, push_dot, d4 if ki else 0.0, d5, steady * p.encoder.angle, steady * p.encoder.ripple),
         radius=sqrt(size**2 + zeta**2 - eps_e**2),
         eps_e=needed,
         omega_e=omega_e,
@@ -281,7 +284,7 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         half_angle=half_angle,
         slow=slow,
         fast=fast,
-        noise=d5,
+        noise=noise,
         hold=hold,
         deviation=deviation,
     )

@@ -97,7 +97,8 @@ def system(axis: Axis) -> System:
     if axis.ki:
         f -= axis.ki * unit["integral"]
     applied = unit.get("torque", f)
-    A, E = np.zeros((len(names), len(names))), np.zeros((len(names), 5))
+    A: Floats = np.zeros((len(names), len(names)))
+    E: Floats = np.zeros((len(names), 5))
     A[0] = unit["omega"] / 2
     A[1] = axis.phi * (applied - damping * unit["omega"]) / axis.J
     E[0, 0], E[1, 0], E[1, 1] = 1.0, -2 * axis.alpha / axis.J, 1 / axis.J
@@ -109,16 +110,16 @@ def system(axis: Axis) -> System:
     if axis.lag:
         A[at["torque"]], E[at["torque"], 4] = (f - applied) / axis.lag, 1 / axis.lag
     else:
-        E[1, 4] = axis.phi / axis.J
-    K: Floats = -np.linalg.solve(A, E[:, 1]) * axis.phi
+        E[1, 4] = 1 / axis.J
+    K: Floats = np.asarray(-np.linalg.solve(A, E[:, 1]) * axis.phi, dtype=np.float64)
     E[:, 2] = -K
     z = np.stack([unit["eps"], unit["omega"] + axis.share * unit["eps"]])
-    M: Floats = np.linalg.pinv(z)
-    M[2:] = 0.0
+    M: Floats = np.zeros((len(names), 2))
+    M[:2] = [[1.0, 0.0], [-axis.share, 1.0]]
     if axis.bandwidth:
         M[at["rate"]] = M[1]  # the filter and the rotors in balance
     if axis.lag:
-        M[at["torque"]] = f @ M
+        M[at["torque"]] = f.dot(M)
     outputs = {
         "eps": unit["eps"], "omega": unit["omega"], "integral": unit.get("integral", 0 * f), "feedback": f,
         "applied": applied, "gap": f - applied,
