@@ -226,7 +226,9 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     delta_q = p.delta_q(asin(eps_e))
     delta_R = 2 * delta_q
     delta_omega = p.delta_omega + p.encoder.turn * omega
-    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega)
+    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (
+        p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega
+    )
     filtered = p.encoder.lag * omega_e_dot  # what the linear equations have of the filter only for k_d, c and θ̂(t₀)
     delta_omega_e = delta_omega + delta_R * p.k_omega_d
     if len(set(law.kp)) == len(set(law.kd)) == 1:  # parts of one error at right angles to each other

@@ -50,8 +50,9 @@ def _unit(rng: np.random.Generator, size: int) -> Array:
     return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
 
 
-def _point(rng: np.random.Generator, bound: float) -> Point:
-    """A moving state. Every other θ̂ lies where the projection acts, between k_θ and k_θ/0.95."""
+def _point(rng: np.random.Generator, p: AdaptiveSettings, share: float = 1.0) -> Point:
+    """A moving state. Of a whole share of k_θ, every other θ̂ lies where the projection acts, up to k_θ/0.95."""
+    bound = share * p.damping_bound
     length = rng.uniform(1.0, 1 / 0.95) if rng.uniform() < 0.5 else rng.uniform()
     return Point(
         q=_unit(rng, 4),
@@ -59,7 +60,7 @@ def _point(rng: np.random.Generator, bound: float) -> Point:
         q_d=_unit(rng, 4),
         omega_d=rng.normal(size=3),
         omega_d_dot=rng.normal(size=3),
-        theta=_unit(rng, 3) * length * bound,
+        theta=np.array(p.damping_estimate) + _unit(rng, 3) * length * bound,
         true_theta=rng.normal(size=3) * bound,
     )
 
@@ -167,7 +168,7 @@ def test_the_law_agrees_with_the_twin_at_moving_states(paper: bool, s: float) ->
         e = ca.vertcat(law.eta_e, law.eps_e)
         function = loop.evaluator(law.u, law.theta_dot, law.tau, e, law.omega_e, law.z1, law.z2)
         for _ in range(100 if paper else 5):
-            x = _point(rng, p.damping_bound)
+            x = _point(rng, p)
             t = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
             expected = (t.u, t.theta_dot, t.tau, t.e, t.omega_e, t.z1, t.z2)
             assert all(_close(a, b) for a, b in zip(_values(function, x, s), expected, strict=True))
@@ -181,7 +182,7 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
     period = 0.01
     for _ in range(30):
         p = _random_settings(rng)
-        x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
+        x = _point(rng, p, 0.5)  # so far inside k_θ that a period does not lead out
         expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
         tick = law_function(Adaptive(p, period, 3))(
             last=x.q,
@@ -214,7 +215,7 @@ def test_without_quantization_the_lyapunov_function_falls_exactly_as_c25_says(pa
         power = ca.fabs(z2).T @ ca.fabs(ca.SX(np.array(p.allocation))) @ ca.fabs(loop.law.u)
         function = loop.evaluator(ca.vertcat(*loop.rates(V)), power, loop.law.eps_e, z2)
         for _ in range(30):
-            addends, through_B, eps_e, z_2 = _values(function, _point(rng, p.damping_bound), s)
+            addends, through_B, eps_e, z_2 = _values(function, _point(rng, p), s)
             promised = -eps_e @ np.diag(p.C1) @ eps_e - z_2 @ np.diag(p.C2) @ z_2  # (C.25) with (C.49)
             # V̇ is a sum of large addends that cancel, z₂ᵀB u among them: it can be no more exact than 2e-16 of these,
             # times the few hundred operations behind each.
@@ -233,7 +234,7 @@ def test_without_quantization_c46_is_the_derivative_of_the_virtual_control(s: fl
         alpha = loop.law.omega_e - loop.law.z2  # (C.19)
         function = loop.evaluator(alpha, ca.vertcat(*loop.rates(alpha)))
         for _ in range(10):
-            x = _point(rng, p.damping_bound)
+            x = _point(rng, p)
             value, rates = _values(function, x, s)
             rates = rates.reshape(-1, 3)  # a row for each thing that moves
             expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
@@ -298,17 +299,18 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     rng = np.random.default_rng(10)
     p = AdaptiveSettings(Gamma=_triple(0.02 * gain * np.ones(3)))
     tick, gains = law_function(Adaptive(p, 0.002, 3)), [*p.C1, *p.C2, *p.Gamma]
-    theta = np.array([0.0, 0.0, p.damping_bound])
-    x = _point(rng, p.damping_bound)
+    first = np.array(p.damping_estimate)
+    theta = first + [0.0, 0.0, p.damping_bound]
+    x = _point(rng, p)
     pressed = 0
     for k in range(3000):
         if k % 300 == 0:
-            x = _point(rng, p.damping_bound)  # another drive, kept long enough to press against the bound
+            x = _point(rng, p)  # another drive, kept long enough to press against the bound
         desired = x.q_d, x.omega_d, x.omega_d_dot
         theta = _array(tick(x.q, [*theta, 1.0], gains, _sent(x.q), x.omega, *desired)[2])[:3]
-        pressed += bool(np.linalg.norm(theta) > p.damping_bound)
+        pressed += bool(np.linalg.norm(theta - first) > p.damping_bound)
         # scaling to a length of k_θ/0.95 rounds in the last place
-        assert np.linalg.norm(theta) <= p.damping_bound / 0.95 * (1 + 1e-15)
+        assert np.linalg.norm(theta - first) <= p.damping_bound / 0.95 * (1 + 1e-14)
     assert pressed > 300
 
 
