@@ -137,4 +137,4 @@ def _shape_of(key: str) -> Shape | None:
     topic = address.topic if (address := topics.read_key(key)) else None
     if topic is None or topic.model is None:
         return _TRACE if topic and topic.kind == "trace" else None
-    return json_shape(f"aeroloop.{topic.title}", topic.model)
+    return json_shape(topic.model)

@@ -12,7 +12,7 @@ import pytest
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.viewers.channels import SHAPES
-from aeroloop.service.viewers.layout import layout
+from aeroloop.service.viewers.schemas import layout
 
 PANELS = {
     "3D": {"followTf", "followMode", "cameraState", "scene", "topics", "transforms", "layers"},
@@ -61,12 +61,14 @@ def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
     """A topic with a dot in it stands in quotes."""
     found = paths(made(vehicle, 3))
     for path in found:
-        parts = re.fullmatch(r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)', path)
+        parts = re.fullmatch(
+            r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
+        )
         assert parts is not None, path
         assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
         assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
     shown = {path.rpartition(".")[2] for path in found}
-    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "latency_p99_us", "state"} <= shown
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "p99", "state"} <= shown
 
 
 def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws() -> None:
