@@ -223,17 +223,3 @@ def test_heartbeats_carry_state_fingerprint_and_cause_or_session(state: PlantSta
         if number <= len(TripCause):
             cause = ["none", *map(str, TripCause)][number]
             assert read(WireSpec()).decode_message(0x300 + NODE, packed) == {**both, "cause": cause}
-
-
-@pytest.mark.parametrize(
-    ("node", "period_ns", "says"),
-    [
-        (0, PERIOD_NS, "1 to 127, not 0"),
-        (128, PERIOD_NS, "1 to 127, not 128"),
-        (NODE, 0, "period of 0 ns"),
-        (NODE, 65_535_000_001, "period of 65535000001 ns"),
-    ],
-)
-def test_what_is_out_of_bounds_is_refused(node: int, period_ns: int, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        dbc(WireSpec(), node, period_ns)
