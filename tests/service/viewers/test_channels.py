@@ -86,16 +86,6 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
     }
 
 
-@pytest.mark.parametrize("actuators", [1, 3, 8])
-def test_any_number_of_motors_without_a_quantizer_is_shown_and_no_more(actuators: int) -> None:
-    overrides = [f"wire.actuators={actuators}", "wire.voltage.bits=cont"]
-    volts = [1.5, -24.0, 0.0, 1.0, 2.0, 3.0, 4.0, 24.0][:actuators]
-    packed = load(None, overrides).wire.command.pack(0, volts)
-    (shown,) = configured(None, *overrides).take(address("command"), packed, NOW)
-    absent = [None] * (8 - actuators)
-    assert list(said(shown).values()) == [*volts, *absent, *(abs(u) == 24.0 for u in volts), *absent]
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_tracking_has_the_measured_attitude_where_the_error_puts_it(sign: int) -> None:
     error = about(2, radians(10.0))
@@ -212,14 +202,6 @@ def test_silence_in_lockstep_shows_nothing_new_and_is_malformed_where_frames_are
     decoder = configured(25.0, "wire.transmit.measurement=on_change")
     assert [decoder.take(address(name), b"", NOW) for name in ("measurement", "command")] == [[], []]
     assert decoder.malformed == 1
-
-
-def test_vehicles_have_descriptions_and_rates_of_their_own() -> None:
-    decoder = configured(1.0)
-    decoder.configure(description("plant", vehicle="other"))
-    for vehicle in ("aero", "other"):
-        shown = decoder.take(address("trace", vehicle=vehicle), RAW["trace"], NOW)
-        assert {one.topic.split("/")[1] for one in shown} == {vehicle}
 
 
 # ── at which rate ──
