@@ -111,10 +111,15 @@ class LogFile:
     # ── the disk ──
 
     @property
+    def removed(self) -> bool:
+        """Whether the file has no name any more, or is closed."""
+        return self._file.closed or os.fstat(self._file.fileno()).st_nlink == 0
+
+    @property
     def replaced(self) -> bool:
         """Whether the file was moved or removed while it was written."""
         with suppress(OSError):
-            return not os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
+            return self.removed or not os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
         return True
 
     def commit(self) -> None:

@@ -120,6 +120,8 @@ class RollingLog:
             RecorderError: Not all could be written; all written before is whole.
         """
         try:
+            if self._file.replaced:
+                self._next_file()
             self._file.commit()
             self._unwritten.clear()
             self._end(self._file)
@@ -171,10 +173,14 @@ class RollingLog:
 
         The last one gets what is unwritten, too, if it takes it: where it was moved to, it is whole.
         """
-        last, self._file = self._file, self._begin()
+        last = self._file
+        if last.removed:
+            last.abandon()  # while it is open, it takes its room from a disk that may be full
+        self._file = self._begin()
         self._unwritten.clear()
         try:
-            self._end(last)
+            if not last.removed:
+                self._end(last)
         except OSError as error:
             last.abandon()
             what = f"the index of {last.path} could not be written: {error.strerror}"

@@ -219,6 +219,25 @@ def test_a_moved_file_and_a_missing_folder_are_reported_and_the_moved_file_is_wh
     assert numbers(folder / "a-0002.mcap")[-100:] == list(range(100, 200))
 
 
+def test_a_file_that_is_removed_to_make_room_gives_its_room_back_and_one_that_is_removed_at_last_costs_nothing(
+    tmp_path: Path, disk: Disk
+) -> None:
+    run = Run(tmp_path / "a.mcap")
+    disk.room = 0
+    run.take(100)
+    (tmp_path / "a.mcap").unlink()
+    run.wait(rolling.RETRY_S)
+    assert str(tmp_path) not in str([os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")])
+    assert run.log.trouble
+    disk.room = EVERYTHING
+    run.wait(rolling.RETRY_S)
+    run.take(100)
+    run.log.path.unlink()
+    run.take(10)
+    run.log.close()
+    assert numbers(run.log.path)[-10:] == list(range(200, 210))
+
+
 def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path, disk: Disk) -> None:
     run = Run(tmp_path / "a.mcap", max_file_s=2.0)
     disk.at_heads = errno.EACCES
