@@ -222,9 +222,10 @@ def test_a_moved_file_and_a_missing_folder_are_reported_and_the_moved_file_is_wh
 def test_a_file_that_is_removed_to_make_room_gives_its_room_back_and_one_that_is_removed_at_last_costs_nothing(
     tmp_path: Path, disk: Disk
 ) -> None:
-    run = Run(tmp_path / "a.mcap")
+    run = Run(tmp_path / "a.mcap", chunk_s=1.0)
     disk.room = 0
     run.take(100)
+    run.wait(1.0)
     (tmp_path / "a.mcap").unlink()
     run.wait(rolling.RETRY_S)
     assert str(tmp_path) not in str([os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")])
