@@ -26,7 +26,6 @@ from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording import recorder, rolling
-from aeroloop.service.recording.log_file import TRACE_ENCODING
 from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
@@ -190,12 +189,13 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         for said in ends.tick(k, 10**10 + k * 2_000_000, START_NS + k * 2_000_000):
             publish(said.key, said.payload)
     for _ in range(2):
-        running = record(max_file_s=0.001)
+        running = record(max_file_s=0.001, decoded_hz=10.0)
         eventually("two files", lambda running=running: len(parts(running.path)) > 2)  # type: ignore[misc]
         running.end()
         assert {key: running.of(key) for key in published} == published
         assert running.losses() == []
         assert descriptions(parts(running.path)[-1])[DESCRIPTION] == published[DESCRIPTION][0]
+        assert len(running.of("/aero/pose")) == pytest.approx(10, abs=1)  # of a second
 
 
 def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
@@ -209,34 +209,6 @@ def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
     running.await_written(4)
     running.end()
     assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
-
-
-def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishers_numbers(
-    gathering: Gathering, record: Record
-) -> None:
-    session = gathering.join()
-    description = CachedPublisher(session, DESCRIPTION, per_s=1)
-    description.put(description_of(load(), "plant").encode())
-    trace = CachedPublisher(session, TRACE, per_s=10)
-    ends, ticks = Ends(load()), [START_NS + k * 2_000_000 for k in range(100)]
-    said = [one for k, at_ns in enumerate(ticks) for one in ends.tick(k, 10**10 + at_ns - START_NS, at_ns)]
-    batches = [one.payload for one in said if one.key == TRACE]
-    running = record(decoded_hz=10_000.0)
-    running.await_written()
-    for batch in batches:
-        trace.put(batch)
-    running.await_written(5)
-    running.end()
-    times, raw = [], []
-    with running.path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.topic == "/aero/pose":
-                times.append(message.publish_time)
-            elif channel.topic == TRACE:
-                assert (channel.message_encoding, schema and schema.encoding) == (TRACE_ENCODING, TRACE_ENCODING)
-                raw.append((message.sequence, message.data))
-    assert raw == list(enumerate(batches))
-    assert times == ticks
 
 
 def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
