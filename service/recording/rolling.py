@@ -233,9 +233,10 @@ class RollingLog:
             for _, size, path in stats:
                 if room >= 0:
                     return
-                path.unlink()
-                room += size
-                self._report(f"removed {path}, the oldest, to keep logs under {keep_gb:g} GB", False)
+                with suppress(OSError):
+                    path.unlink()
+                    room += size
+                    self._report(f"removed {path}, the oldest, to keep logs under {keep_gb:g} GB", False)
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file's metadata name this run or, if runs are named by the time, any run so named."""
