@@ -63,13 +63,10 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
     kept = {key: schema[key] for key in _KEPT if key in schema}
     if "$ref" in schema:
         return _plain({**definitions[schema["$ref"].rpartition("/")[2]], **kept}, definitions)
-    alternatives = [one for one in schema.get("anyOf") or schema.get("oneOf") or [] if one.get("type") != "null"]
+    alternatives = [one for one in schema.get("anyOf", []) if one.get("type") != "null"]
     if alternatives:
-        found = [_plain(one, definitions) for one in alternatives]
-        if all(one is not None and one["type"] == "object" for one in found):
-            together = {name: field for one in found if one for name, field in one["properties"].items()}
-            return {"type": "object", "properties": together, **kept}
-        return {**found[0], **kept} if len(found) == 1 and found[0] else None
+        only = _plain(alternatives[0], definitions) if len(alternatives) == 1 else None
+        return only and {**only, **kept}
     match schema.get("type"):
         case "object":
             fields = {name: _plain(field, definitions) for name, field in schema.get("properties", {}).items()}
