@@ -235,16 +235,6 @@ def test_what_cannot_be_reached_but_may_have_more_is_named_and_not_waited_for() 
     assert complete == [False, False, False, True, True, True]
 
 
-def test_what_a_cache_dropped_before_the_first_contact_is_no_loss() -> None:
-    made = Made(10)
-    for _ in range(100):
-        made.publish()
-    made.receive(made.publish())
-    made.answer_all()
-    assert sorted(made.found) == list(range(91, 101))
-    assert made.lost(finished=True) == []
-
-
 def test_a_plain_publisher_is_received_too_at_its_time_of_arrival() -> None:
     made = Made(10)
     made.receive_sample(SimpleNamespace(key_expr=KEY, payload=zenoh.ZBytes(b"plain"), attachment=None))
