@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,6 @@ from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.testing.hil import Hil
 from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
 from tests.support.can_stage import measurement
@@ -95,21 +93,3 @@ def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[Ca
 
 
 # On real processes
-
-
-def test_in_real_time_a_loop_over_a_bus_goes_on_with_fewer_frames(tmp_path: Path) -> None:
-    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
-    with Hil(tmp_path, plant="can-node") as hil:
-        hil.start(settings={**patient, "wire.transmit": "on_change"})
-        hil.run(1.5)
-        log = hil.log
-    figures = log.figures
-    ticks_per_s = 500
-    assert figures.trips == []
-    assert figures.duration_s > 1
-    for stream in (figures.measurement, figures.command):
-        assert stream.frames_per_s is not None
-        assert ticks_per_s / 15 * 0.9 < stream.frames_per_s < 0.85 * ticks_per_s
-    assert figures.final_error_deg is not None
-    assert figures.final_error_deg < 10
-    assert all(frame for name in ("measurement", "command") for _, frame in log.messages(name))
