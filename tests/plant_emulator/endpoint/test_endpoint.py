@@ -100,17 +100,6 @@ def test_a_granted_claim_waits_so_long_for_its_first_command(counter_bits: int, 
     assert set(plant.held) == {OFF}
 
 
-def test_a_command_without_a_valid_value_trips_at_once_and_a_lost_holder_by_its_name() -> None:
-    endpoint, plant = claimed()
-    endpoint.tick(command(0), 1)
-    assert endpoint.tick(WIRE.command.pack(1, [5, WIRE.voltage.quantizer().invalid]), 2) is None
-    assert plant.held[-1] == OFF
-    endpoint.claim(claim_of("b"))
-    endpoint.lost("b")
-    texts = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
-    assert texts == ["a commands 'no valid value': 0 V", "b is gone: 0 V"]
-
-
 # ── measurements ──
 
 SIGNALS = (

@@ -308,13 +308,6 @@ def test_a_stream_that_is_late_for_good_drives_within_the_watchdogs_time_and_nev
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_a_counter_that_is_short_by_configuration_detects_no_such_stream(
-    end: Callable[..., EndpointEnd | RelayEnd],
-) -> None:
-    assert acted(end(watchdog=50, armed=True), delay=COUNTERS)
-
-
-@pytest.mark.parametrize("end", ENDS)
 def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive(
     end: Callable[..., EndpointEnd | RelayEnd],
 ) -> None:

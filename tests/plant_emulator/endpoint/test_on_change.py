@@ -90,13 +90,6 @@ def test_in_real_time_no_frame_holds_for_the_watchdogs_time_and_an_empty_one_is_
         assert (endpoint.accepted, endpoint.refused) == (2, 0 if frame is None else 14 + WATCHDOG_TICKS)
 
 
-def test_an_empty_command_in_lockstep_is_refused_where_commands_are_periodic() -> None:
-    endpoint, _ = claimed(wire_of("on_change", "periodic"), lockstep=True)
-    endpoint.tick(command(0), 1)
-    endpoint.tick(UNCHANGED, 2)
-    assert (endpoint.refused, endpoint.accepted) == (1, 1)
-
-
 def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_none_of_the_last_session() -> None:
     endpoint, plant = claimed(BOTH, lockstep=True)
     endpoint.tick(command(0, 7), 1)

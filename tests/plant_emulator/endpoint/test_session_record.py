@@ -12,7 +12,7 @@ from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.protocol.messages.models import Grant, SessionRecord
 from aeroloop.protocol.messages.operator import Gains, Hold
 from aeroloop.protocol.messages.states import TripCause
-from tests.support.plant_end import PERIOD_NS, WIRE, RecordingPlant, claim_of, claimed
+from tests.support.plant_end import PERIOD_NS, WIRE, RecordingPlant, claim_of
 
 GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 
@@ -73,36 +73,6 @@ def test_the_next_controller_gets_the_last_record_and_how_its_session_ended(
     assert last_granted(end, "b") == record("a", yaw=50.0).model_copy(update={"ended": how})
     end.release("of-b")
     assert last_granted(end, "c") is None  # a session without a record leaves none
-
-
-def test_the_record_names_the_sessions_last_tick() -> None:
-    end, _ = claimed()
-    for k in range(1, 5):
-        end.tick(None, k)
-    end.keep(record("a"))
-    end.lost("a")
-    assert end.last is not None
-    assert end.last.ended_tick == end.session_tick == 4
-
-
-@pytest.mark.parametrize(
-    ("trips", "events", "cause"),
-    [
-        (lambda end: end.stop(), ["tripped"], "stopped by an operator: 0 V"),
-        (lambda end: end.lost("a"), ["tripped", "changed"], "a is gone: 0 V; then stopped by an operator"),
-    ],
-)
-def test_a_repeated_stop_is_no_second_trip_and_the_first_cause_stays(
-    end: VehicleClaim, trips: Callable[[VehicleClaim], object], events: list[str], cause: str
-) -> None:
-    end.claim(claim_of())
-    end.notices.clear()
-    trips(end)
-    trip = end.trip
-    for _ in range(3):
-        end.stop()
-    assert [notice.kind for notice in end.notices] == events
-    assert (end.trip, end.cause) == (trip, cause)
 
 
 def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: VehicleClaim) -> None:

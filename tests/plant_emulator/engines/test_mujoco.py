@@ -256,21 +256,6 @@ def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:
     assert twin.measure().rate[1] < -0.1 < 0.1 < twin.measure().rate[2]
 
 
-def test_the_rate_is_that_of_the_instant_of_the_attitude() -> None:
-    """A constant torque: the rate rises evenly, and is not that before the last step."""
-    wheel = """
-    <mujoco>
-      <option integrator="implicitfast"/>
-      <worldbody>
-        <body name="body"><joint name="z" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body>
-      </worldbody>
-      <actuator><motor joint="z" gear="3"/></actuator>
-    </mujoco>
-    """
-    (*_, last) = _driven(MujocoPlant(MujocoSettings(model=wheel), PERIOD), [(4.0,)] * 10)
-    assert last.rate == pytest.approx((0.0, 0.0, 4.0 * 3 / 2 * 10 * PERIOD), abs=1e-12)
-
-
 def test_controls_at_0_v_are_the_keyframes_and_close_goes_there() -> None:
     """At hover the weight is carried, so nothing moves; the attitude is measured where it starts."""
     plant = MujocoPlant(QUADROTOR.model_copy(update={"attitude": (0.0, 0.0, 0.0, 2.0)}), PERIOD)

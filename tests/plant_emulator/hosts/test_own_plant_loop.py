@@ -100,11 +100,6 @@ def test_a_failed_plant_is_replayed_up_to_its_failure() -> None:
     assert "Turntable failed in measure()" in (results[1].stopped or "")
 
 
-def test_nan_trips_by_the_limit_of_invalid_values() -> None:
-    stage = stage_of("Turntable", WireSpec(actuators=1), {"gives": "nan"}, [], lockstep=False).run(100)
-    assert stage.endpoint.trip is TripCause.SENSORS
-
-
 @pytest.mark.parametrize(
     ("kind", "wire", "faults", "line"),
     [

@@ -70,28 +70,6 @@ def test_encoders_read_whole_counts_within_one_count_of_the_truth() -> None:
     assert (spread > 0.98).all()
 
 
-def _zero(axis: int, seed: int) -> float:
-    """Where within a count an encoder is zeroed: how much of the count from 0 on it already reads as 1."""
-    sensors = _sensors(rate="perfect", seed=seed, counts=(1000, 1000))
-    step = 2 * pi / 1000
-    read = 0
-    for k in range(64):
-        angles = [0.0, 0.0]
-        angles[axis] = (k + 0.5) / 64 * step
-        read += _angles(sensors.read(IDENTITY, AT_REST, angles).attitude)[axis] > step / 2
-    return read / 64
-
-
-def test_the_seed_shifts_the_zero_anywhere_within_a_count() -> None:
-    zeros = np.array([[_zero(axis, seed) for axis in (0, 1)] for seed in range(100)])
-    assert _zero(0, 7) == zeros[7, 0]  # and always to the same place
-    # An even spread over 0…1 has the mean ½, the deviation 1/√12 and the kurtosis 1.8: of n seeds the mean is known to
-    # 1/√(12 n), the deviation to ½ √(0.8/n) of itself, a correlation to 1/√n. A 64th is as fine as `_zero` looks.
-    assert zeros.mean(axis=0) == pytest.approx([0.5, 0.5], abs=5 / sqrt(1200))
-    assert zeros.std(axis=0) * sqrt(12) == pytest.approx([1, 1], rel=5 * 0.5 * sqrt(0.8 / 100))
-    assert abs(np.corrcoef(zeros.T)[0, 1]) < 5 / sqrt(100)
-
-
 def test_the_attitude_of_encoders_is_yaw_then_pitch() -> None:
     """R_z(yaw) R_y(pitch), multiplied out as matrices."""
     sensors = _sensors(rate="perfect", counts=FINE)
@@ -113,16 +91,6 @@ def test_the_rate_of_encoders_is_that_of_the_joints_in_the_body_frame() -> None:
         _, rate = sensors.read(IDENTITY, AT_REST, [p, dy * k * PERIOD])
     # The ripple of a held ramp, (ωn T)²/12 and a tenth for the next order. Counts of l shake it by less than ωn l.
     assert rate == pytest.approx([-sin(p) * dy, dp, cos(p) * dy], abs=0.9 * (50 * PERIOD) ** 2 / 12 * 1.1 + 50 * 1.5e-6)
-
-
-def test_the_derivative_is_of_the_angles_as_counted() -> None:
-    """At rest but for less than a count there is no rate; a count is a step, and its rate the step's response."""
-    step = 2 * pi / 2048
-    sensors = _sensors(counts=(2048, 4096), seed=1)
-    assert all(sensors.read(IDENTITY, AT_REST, [0.0, 0.0]).rate == AT_REST for _ in range(10))
-    for n in range(1, 50):
-        _, rate = sensors.read(IDENTITY, AT_REST, [step, 0.0])
-        assert rate[1] == pytest.approx(step * _step_response(n * PERIOD), abs=1e-14)  # rounding, of 0.06 rad/s
 
 
 def test_a_gyro_adds_its_noise_and_bias_to_the_true_rate() -> None:

@@ -64,17 +64,3 @@ def test_gusts_have_the_configured_mean_deviation_and_memory_whatever_the_period
         assert np.abs(correlation - exp(-seconds / memory)).max() < 5 * sqrt(spread)
     cross = (x[:, 0] * x[:, 1]).mean() / sigma**2
     assert abs(cross) < 5 * sqrt((1 + rho**2) / (1 - rho**2) / n)  # the axes are independent
-
-
-def test_gusts_are_there_from_the_first_sample() -> None:
-    first = np.array([_blown(1, gust=1.0, period=PERIOD, seed=seed)[0] for seed in range(80)]) - FAN
-    # Of n samples a deviation is known to 1/√(2n); a gust that started at 0 would have a sixteenth of it.
-    assert first.std() / (hypot(*FAN) / sqrt(2)) == pytest.approx(1, abs=5 / sqrt(2 * first.size))
-
-
-def test_a_gust_goes_on_from_where_it_was() -> None:
-    """What is new in a sample, x − ρ x₋₁, is normal with the deviation σ √(1 − ρ²), never the gust starting anew."""
-    x = (_blown(20_000, gust=1.0, period=PERIOD, gust_time_s=1.0) - FAN) / (hypot(*FAN) / sqrt(2))
-    rho = exp(-PERIOD)
-    new = (x[1:] - rho * x[:-1]) / sqrt(1 - rho * rho)
-    assert np.abs(new).max() < 6  # of 40 000 normal numbers one in 10⁴ times has one beyond; a new start is some 22

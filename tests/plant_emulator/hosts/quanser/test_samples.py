@@ -126,19 +126,6 @@ def test_after_a_failed_read_the_attitude_is_the_joints_and_the_filter_starts_an
     assert plant.measure().rate == (0.0, 0.0, 0.0)  # at rest until the filter has seen more
 
 
-def test_reads_that_fail_take_their_time(clock: HandClock) -> None:
-    """With nothing to wait for, a loop would spin."""
-    plant, board = plant_on_board()
-    plant.advance()
-    plant.advance()
-    assert clock.slept == []  # a good one has waited for its sample
-    board.fail_next("task_read", 3)
-    for work_ns in (500_000, 5_000_000, 0):  # of its owner: within a period, and longer than one
-        plant.advance()
-        clock.ns += work_ns
-    assert clock.slept == pytest.approx([PERIOD, PERIOD - 0.0005, 0.0], abs=1e-9)
-
-
 # Samples that are not read in time
 
 
@@ -160,34 +147,6 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
     plant.advance()
     assert not is_nothing(plant.measure())
     assert (board.time, plant.passed) == (now + 1, 1)
-
-
-def test_for_the_filter_the_newest_sample_lasts_as_long_as_those_that_were_lost() -> None:
-    plant, board = plant_on_board()
-    filtered = FilteredDerivative(50.0, 0.8, PERIOD)
-    filtered.update(0.0)
-    plant.advance()
-    filtered.update(0.0)
-    turn_encoders(board, 0, 40)
-    board.let_pass(4)
-    plant.advance()
-    for _ in range(4):
-        rate = filtered.update(2 * pi / 4096 * 40)
-    assert plant.measure().rate == (0.0, 0.0, rate)
-    assert rate > 0.5
-
-
-def test_a_failed_read_counts_as_a_period_once() -> None:
-    plant, board = driven_plant()
-    for _ in range(5):
-        board.fail_next("task_read")
-        plant.advance()
-        assert plant.passed == 1
-    plant.advance()
-    assert plant.passed == 1
-    board.let_pass(3)
-    plant.advance()
-    assert plant.passed == 3
 
 
 def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:
