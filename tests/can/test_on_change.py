@@ -12,9 +12,8 @@ from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
-from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
-from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
+from tests.support.can_closed_loop import lockstep_settings, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
 from tests.support.can_stage import measurement
 from tests.support.plant_end import PERIOD_NS, RecordingPlant
@@ -30,15 +29,21 @@ POLICIES: list[tuple[Policy, Policy]] = [
 BOTH = wire_of("on_change", "on_change")
 
 
-@pytest.mark.parametrize(("measurement", "command"), POLICIES)
+@pytest.mark.parametrize(
+    ("wire", "fd"),
+    [
+        (WireSpec(), False),
+        (WireSpec().with_bits(12, 16), True),
+        *((wire_of(*policies), False) for policies in POLICIES),
+    ],
+    ids=["classic", "FD", *map("-".join, POLICIES)],
+)
 def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
-    measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
+    wire: WireSpec, fd: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
-    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
-    settings = settings.model_copy(update={"wire": wire_of(measurement, command)})
-    direct = run_experiment(settings, 0.5)
-    on_bus = run_on_bus(virtual(), settings, 0.5)
+    settings = lockstep_settings(wire)
+    on_bus, direct = run_on_bus(virtual(fd=fd), settings, 0.5), run_experiment(settings, 0.5)
     assert on_bus.model_dump(exclude={"reasons"}) == direct.model_dump(exclude={"reasons"})
 
 

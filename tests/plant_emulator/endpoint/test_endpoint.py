@@ -1,7 +1,7 @@
 """Plant endpoint: refused claims, deadlines in words and in time, codes of measurements.
 
 What commands, claims, releases, stops and trips do is in test_freshness.py. Time is the tick index, so every bound on
-time is exact to the tick; period i is the time from tick i to tick i + 1, and `plant.held[i]` are its voltages.
+time is exact to the tick; period i is the time from tick i to tick i + 1, and `plant.periods[i]` are its voltages.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_time_begins_at_tick_0_and_the_very_first_call_takes_no_command(late: in
     frame = endpoint.tick(command(0), late)
     assert frame is not None
     assert WIRE.measurement.counter(frame) == 0
-    assert plant.held == [OFF] * late
+    assert plant.periods == [OFF] * late
     assert endpoint.accepted == 0
 
 
@@ -77,7 +77,7 @@ def test_the_watchdogs_time_can_be_set_and_is_in_the_events_text(watchdog_s: flo
     endpoint.tick(command(0), 1)
     for k in range(2, 300):
         endpoint.tick(None, k)
-    assert plant.held.index(OFF) == ticks
+    assert plant.periods.index(OFF) == ticks
     assert endpoint.notices[-1][:3] == ("tripped", f"no fresh command for {2 * ticks} ms: 0 V", "of-a")
     assert endpoint.notices[-1].tick == ticks
 
@@ -97,7 +97,7 @@ def test_a_granted_claim_waits_so_long_for_its_first_command(counter_bits: int, 
     assert endpoint.tick(None, ticks + 1) is None
     assert state_of(endpoint) is PlantState.TRIPPED
     assert f"no first command within {ticks * 0.002:.3g} s" in endpoint.notices[-1].text
-    assert set(plant.held) == {OFF}
+    assert set(plant.periods) == {OFF}
 
 
 # ── measurements ──

@@ -52,10 +52,10 @@ class EndpointEnd:
 
     def tick(self, frame: bytes | None, ticks: int) -> tuple[bool, list[tuple[float, ...]]]:
         """Receive a command, then measure so many ticks later. Whether it measured; voltages of the periods."""
-        self.plant.held.clear()
+        self.plant.periods.clear()
         measured = self._endpoint.tick(frame, self._endpoint.ticked + ticks)
         assert self.plant.voltages == self.claims.voltages
-        return measured is not None, self.plant.held
+        return measured is not None, self.plant.periods
 
 
 class RelayEnd:

@@ -313,23 +313,3 @@ def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
     ours = json.loads(capsys.readouterr().out)
     for name in FIGURES[:3]:  # compiled or frame by frame: sums differ by some units in the last place
         assert theirs[name] == pytest.approx(ours[name], rel=1e-9)
-
-
-def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words_and_is_closed(
-    configuration: Callable[[str], Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    closed: list[FmuPlant] = []
-    close = FmuPlant.close
-
-    def noted(plant: FmuPlant) -> None:
-        closed.append(plant)
-        close(plant)
-
-    monkeypatch.setattr(FmuPlant, "close", noted)
-    failing = ["--set", "plant.own.start.fails_at=0.5", "--set", "plant.own.start.fails_with=3"]
-    assert execute(["lab", "experiment", "--duration", "2", "--config", str(configuration("fmi2")), *failing]) == 1
-    assert capsys.readouterr().err == (
-        "aeroloop: FmuPlant failed in advance(): aero.fmu: it failed at 0.5 s: fmi2DoStep failed with status 3 (error):"
-        " the motor burnt at 0.5 s\n"
-    )
-    assert len(closed) == 1

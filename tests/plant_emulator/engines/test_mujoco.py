@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings, lagged
-from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings
 from aeroloop.plant_emulator.model.emulated import FrictionSettings, RotorSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
@@ -121,20 +120,6 @@ def _experiment(coulomb: bool, bits: int | str) -> Settings:
     )
 
 
-def test_accelerations_of_the_aero_are_ours_at_any_state() -> None:
-    model = mujoco.MjModel.from_xml_string(SMOOTH)
-    data, ours, friction = mujoco.MjData(model), aero_dynamics(AeroSettings()), FrictionSettings()
-    rng = np.random.default_rng(1)
-    for _ in range(100):
-        pitch, yaw = rng.uniform(-3, 3, 2)
-        rates, u = rng.normal(size=2) * 3, rng.uniform(-24, 24, 2)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (yaw, pitch), rates[::-1], u
-        mujoco.mj_forward(model, data)
-        load = -np.array(friction.viscous) * rates
-        expected = np.array(ours([pitch, yaw, *rates], u, load)).ravel()[2:]
-        assert data.qacc[::-1] == pytest.approx(expected, rel=1e-9, abs=1e-11)
-
-
 @pytest.mark.parametrize(
     ("coulomb", "bits", "held_deg", "closed_deg"),
     [
@@ -231,16 +216,6 @@ def test_two_runs_are_the_same_to_the_last_bit(twin: MujocoSettings) -> None:
     one, other = (MujocoPlant(twin, PERIOD) for _ in range(2))
     voltages = np.random.default_rng(3).uniform(-10, 10, (300, one.actuators)).tolist()
     assert _driven(one, voltages) == _driven(other, voltages)
-
-
-def test_lag_is_that_of_our_rotors() -> None:
-    rotor = RotorSettings(lag_up_s=0.1, lag_down_s=0.2)
-    for voltage, command in np.random.default_rng(4).normal(size=(20, 2)):
-        fine, steps = voltage, 20_000
-        for _ in range(steps):
-            rising = (command - fine) * fine >= 0
-            fine += (command - fine) / (0.1 if rising else 0.2) * 0.3 / steps
-        assert lagged(rotor, voltage, command, 0.3) == pytest.approx(fine, abs=1e-4)
 
 
 def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from aeroloop.plant_emulator.model.aero import Aero, AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
 from aeroloop.plant_emulator.model.emulated import (
     FrictionSettings,
     RotorSettings,
@@ -179,33 +179,6 @@ def _driven(settings: PlantSettings, periods: int = 300) -> list[tuple[State, Me
         plant.advance()
         seen.append((plant.truth(), plant.measure()))
     return seen
-
-
-def test_with_every_piece_off_the_plant_is_the_bare_mechanism() -> None:
-    """Its equations of motion, in a Runge–Kutta step typed here."""
-    p = AeroSettings(inertia=(0.02, 0.03, 0.04), damping=(0.01, 0.02, 0.03))
-    dynamics = aero_dynamics(p)
-
-    def slope(x: Array, u: tuple[float, ...]) -> Array:
-        return np.array(dynamics(x, u, np.zeros(2)), dtype=np.float64).ravel()
-
-    x, h = np.zeros(4), PERIOD / BARE.substeps
-    for k, (state, measured) in enumerate(_driven(_with(aero=p), 200)):
-        u = _voltages(k)[:2]
-        for _ in range(BARE.substeps):
-            a = slope(x, u)
-            b = slope(x + h / 2 * a, u)
-            c = slope(x + h / 2 * b, u)
-            d = slope(x + h * c, u)
-            x = x + h / 6 * (a + 2 * b + 2 * c + d)
-        pitch, yaw = (float(angle) / 2 for angle in x[:2])
-        q = [cos(yaw) * cos(pitch), -sin(yaw) * sin(pitch), cos(yaw) * sin(pitch), sin(yaw) * cos(pitch)]
-        omega = [-sin(x[0]) * x[3], x[2], cos(x[0]) * x[3]]
-        # the same operations: rounding of some tens a step, 400 steps, of values up to 1
-        assert state.attitude == pytest.approx(q, abs=1e-13)
-        assert state.rate == pytest.approx(omega, abs=1e-13)
-        assert state.voltages == u
-        assert measured == (state.attitude, state.rate)
 
 
 GUSTY = PlantSettings(wind=WindSettings(blowing=True, gust=0.5), rotor=RotorSettings(dead_zone_v=1.0))
