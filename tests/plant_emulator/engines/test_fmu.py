@@ -172,8 +172,12 @@ BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]]
         ("", ""),
         "is for model exchange only: export it",
     ),
-    "no binary": ("fmi2", (), (PLATFORM, "win99"), f"has no binary for {PLATFORM}, only for win99: export it on"),
-    "sources": ("fmi2", (), (f"binaries/{PLATFORM}/{LIBRARY}", "sources/a.c"), "only for none: `fmpy compile "),
+    "no binary": (
+        "fmi2",
+        (),
+        (PLATFORM, "win99"),
+        f"has no binary for {PLATFORM}: export it on this platform, or `fmpy",
+    ),
     "GUID": (
         "fmi2",
         (('guid="aero"', 'guid="other"'),),
