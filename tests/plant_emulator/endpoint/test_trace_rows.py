@@ -56,6 +56,19 @@ def inject(text: str) -> Callable[[Stage], None]:
     return do
 
 
+def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_took() -> None:
+    """The controller derives the grid from it; one sent late would put it ticks back."""
+
+    def held_up() -> int:
+        return 5 if stage.endpoint.session is not None and not stage.sent else 0
+
+    stage = Stage(LOOP, WIRE, PLANT, between=at({4: Stage.claim}), answer=answer, skip=held_up)
+    batches = stage.run(20).batches
+    assert rows(batches, "tick") == list(range(11, 21))
+    assert [WIRE.measurement.counter(frame) for frame in stage.sent] == list(range(10))
+    assert stage.skipped == 0  # what was held up is before the session
+
+
 def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
     between = at({4: Stage.claim, 20: lambda stage: stage.endpoint.release("s1"), 30: Stage.claim})
     batches = Stage(LOOP, WIRE, PLANT, between=between, answer=answer).run(400).batches

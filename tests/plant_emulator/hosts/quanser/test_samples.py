@@ -7,13 +7,11 @@ from math import cos, pi, sin
 
 import pytest
 
-from aeroloop.plant_emulator.model.sensors import FilteredDerivative
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.plant_emulator.settings import CardType, QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
 from tests.support.fake_quanser import FakeQuanser
 from tests.support.quanser_board import (
-    PERIOD,
     Calls,
     HandClock,
     drive,
@@ -61,20 +59,6 @@ def test_counts_are_an_angle_each_with_its_sign(signs: tuple[int, int]) -> None:
     p, y = signs[0] * 2 * pi * 160 / 4000 / 2, signs[1] * 2 * pi * -512 / 5000 / 2
     half = cos(y) * cos(p), -sin(y) * sin(p), cos(y) * sin(p), sin(y) * cos(p)  # R_z(yaw) R_y(pitch)
     assert plant.measure().attitude == pytest.approx(half, abs=1e-15)
-
-
-def test_rates_are_the_filtered_derivative_in_the_body_frame() -> None:
-    plant, board = plant_on_board(bandwidth=30.0, damping_ratio=0.7)
-    of_pitch, of_yaw = (FilteredDerivative(30.0, 0.7, PERIOD) for _ in range(2))
-    of_pitch.update(0.0)
-    of_yaw.update(0.0)
-    for k in range(1, 200):
-        turn_encoders(board, 3 * k, -5 * k)
-        plant.advance()
-        p = 2 * pi / 2880 * 3 * k
-        dp, dy = of_pitch.update(p), of_yaw.update(-2 * pi / 4096 * 5 * k)
-        assert plant.measure().rate == pytest.approx((-sin(p) * dy, dp, cos(p) * dy), abs=1e-12)
-    assert dp > 3.0  # 3 counts a sample are 3.27 rad/s
 
 
 @pytest.mark.parametrize(("axes", "signs", "scale"), [((0, 1, 2), (1, 1, 1), 1.0), ((2, 0, 1), (1, -1, -1), 0.5)])
