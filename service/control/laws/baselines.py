@@ -37,13 +37,14 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat
 
 from aeroloop.protocol.wire.attitude import R, S
-from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings
 from aeroloop.service.control.laws.interface import (
     Diagonal,
     ExpressionLaw,
     Floats,
     Gains3,
     LawSettings,
+    MatrixGain,
     Now,
     Vector,
     check_allocation,
