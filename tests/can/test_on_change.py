@@ -95,6 +95,3 @@ def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[Ca
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
     silence = [UNCHANGED, UNCHANGED] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
-
-
-# On real processes

@@ -306,9 +306,6 @@ def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Re
         assert not np.any(followed.at(t + later)[2])
 
 
-# From the attitude of a body
-
-
 # Set-points of a stream
 
 
