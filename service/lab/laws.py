@@ -21,15 +21,21 @@ from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.baselines import NonadaptiveSettings, TrackingSettings
-from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
+from aeroloop.service.control.laws.baselines import (
+    TUNED,
+    NonadaptiveSettings,
+    Response,
+    TrackingSettings,
+    response_of,
+    tuned,
+)
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
 from aeroloop.service.lab.burden import SENSORS
 from aeroloop.service.lab.law_margins import PUSHED_S, survived
 from aeroloop.service.lab.sweep import Progress, Row, RowFile, Sheets, SweepPlan, rows_file, sweep_rows, write_table
 from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
 
-LAWS: Final = ("adaptive", "nonadaptive", *RULES)
+LAWS: Final = ("adaptive", "nonadaptive", *TUNED)
 BITS: Final = ("8/6", "cont/cont")
 WINDS: Final = {"calm": False, "wind": True}
 PLANTS: Final = ("aero", "rigid_body")

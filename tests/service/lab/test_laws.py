@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.control.laws.tuning import response_of
+from aeroloop.service.control.laws.baselines import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.law_margins import Late, least
