@@ -23,10 +23,9 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
-from aeroloop.service.logs.session import Array, Integers, SessionKey
+from aeroloop.service.logs.session import Array, Integers, SessionKey, Unknown
 from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, true_state
 from aeroloop.service.logs.ticks import recompute
 
@@ -177,17 +176,17 @@ def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[Se
         actuators[which[0]][which[1]] = recording.settings(which).wire.actuators
     found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
     malformed = 0
-    for message in recording.messages(
+    for vehicle, message in recording.messages(
         lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in actuators else None
     ):
         try:
-            true = true_state(message.data, actuators[message.answer])
+            true = true_state(message.data, actuators[vehicle])
         except ValueError:
             malformed += 1
             continue
         if true is not None and true.session is not None and true.session_tick is not None:
             row = true.session_tick, *true.attitude, *true.rate, *true.voltages
-            found[message.answer, true.session].append(row)
+            found[vehicle, true.session].append(row)
     columns = {which: 8 + actuators[which[0]][which[1]] for which in chosen}
     return {which: np.array(sorted(its)).reshape(-1, columns[which]) for which, its in found.items()}, malformed
 

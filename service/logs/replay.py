@@ -24,9 +24,8 @@ from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.figures import added, squares
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Missing, Session, SessionKey, Source
+from aeroloop.service.logs.session import Missing, Session, SessionKey, Source, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows, levels
 
 
@@ -292,7 +291,7 @@ def _replay_plants(
         except PlantError as error:
             reasons[source] = str(error)
     done, total = 0, max(1, sum(rows.values()))
-    for source, batch in recording.batches(dict.fromkeys(replays)):
+    for source, batch in recording.batches(replays):
         replays[source].feed(batch)
         done += batch.header.rows
         if progress is not None:
