@@ -114,7 +114,7 @@ def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: 
 def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
     """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
     published = {}
-    for found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
+    for _, found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
         telemetry = Telemetry.model_validate_json(found.data)
         if telemetry.session == SESSION:
             published[telemetry.tick] = telemetry

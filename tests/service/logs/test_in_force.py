@@ -14,7 +14,7 @@ from aeroloop.protocol.messages.trace import RECORD_S, Tail, TraceWriter, read_b
 from aeroloop.service.config import load
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.in_force import InForce, Segment
+from aeroloop.service.logs.session import NO_TICK
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import read
 from tests.support.made_log import SESSION, VEHICLE, Changes, Logged, lockstep, made, write
