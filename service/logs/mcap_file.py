@@ -22,7 +22,6 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     Channel,
     Chunk,
@@ -163,6 +162,8 @@ def with_checksum(name: str, entries: dict[str, str]) -> dict[str, str]:
 def _index(file: BinaryIO) -> list[McapRecord] | None:
     """The records of the index at the end; None if there is none, or it is damaged or not complete."""
     end = os.fstat(file.fileno()).st_size - _FOOTER_BYTES
+    if end < len(MAGIC):
+        return None
     with suppress(*_MALFORMED):
         footer = _record(file, end, _FOOTER_BYTES - len(MAGIC), Opcode.FOOTER)
         assert isinstance(footer, Footer)
@@ -173,9 +174,10 @@ def _index(file: BinaryIO) -> list[McapRecord] | None:
         if zlib.crc32(data[: -_CRC_BYTES - len(MAGIC)]) != footer.summary_crc:
             return None
         index = list(StreamReader(BytesIO(data), skip_magic=True).records)
-        counts = next(one for one in index if isinstance(one, Statistics))
-        stated = counts.chunk_count + counts.metadata_count + counts.attachment_count
-        return index if len(list(_by_index(index))) == stated else None
+        stated = (
+            one.chunk_count + one.metadata_count + one.attachment_count for one in index if isinstance(one, Statistics)
+        )
+        return index if len(_by_index(index)) == next(stated, None) else None
     return None
 
 
@@ -222,10 +224,6 @@ def _record(file: BinaryIO, at: int, size: int, opcode: int) -> McapRecord | Non
         entries = {key: value for key, value in record.metadata.items() if key != CHECKSUM}
         if with_checksum(record.name, entries) != record.metadata:
             raise ValueError(f"metadata {record.name} does not match its checksum")
-    if isinstance(record, Attachment) and zlib.crc32(block[_HEAD.size : -_CRC_BYTES]) != int.from_bytes(
-        block[-_CRC_BYTES:], "little"
-    ):
-        raise ValueError(f"attachment {record.name} does not match its checksum")
     return record
 
 
@@ -233,7 +231,7 @@ def _contents(chunk: Chunk) -> list[McapRecord]:
     """The records in a chunk. Raises one of `_MALFORMED` if it is damaged, or claims to hold more than `MAX_CHUNK`."""
     if chunk.compression not in ("zstd", ""):
         raise ValueError(f"a chunk cannot be read: its compression {chunk.compression!r} is not known")
-    # a zstd frame without a size says 2⁶⁴ − 1 or −1; then the chunk's own size is the limit
+    # −1 of a zstd frame that does not say: it is decompressed up to the chunk's own size
     stated = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
     if max(chunk.uncompressed_size, stated) > MAX_CHUNK:
         raise ValueError(f"a chunk claims to hold {max(chunk.uncompressed_size, stated)} bytes")

@@ -121,7 +121,7 @@ def replay(
     def within(one: Missing | Unknown) -> bool:
         period = periods.get((one.vehicle, one.session))
         last = inf if one.last_tick is None else one.last_tick
-        return period is None or (one.first_tick * period <= until_s and last * period >= since_s)
+        return period is None or (one.first_tick <= until_s / period and last >= since_s / period)
 
     details: dict[End, list[str]] = {}
     unseen: dict[End, list[str]] = {}
@@ -218,7 +218,7 @@ def _replay_session(
             differ.append(i)
 
     computed_as, computed = np.frombuffer(sent_as, np.uint8), np.frombuffer(frames, f"V{wire.command.size}")
-    within = (rows["tick"] * period >= part_s[0]) & (rows["tick"] * period <= part_s[1])
+    within = (rows["tick"] >= part_s[0] / period) & (rows["tick"] <= part_s[1] / period)
     answered, differ = (computed_as != Sent.NONE) & within, [i for i in differ if within[i]]
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
     after, _ = commanded(session, wire, computed_as, computed)

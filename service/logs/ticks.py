@@ -236,7 +236,7 @@ def _computed(session: Session, progress: Progress | None) -> tuple[list[Array],
     found, state = logged.controller.row[: ends[-1] - ends[0]].cast("B"), last["state_next"].cast("B")
     measured, computed = outputs["measured"], outputs["computed"]
 
-    places = np.full(len(session.controller), -1)
+    places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
     over = np.isin(_column(session.plant, session.at_plant, "sent_as"), (Sent.NONE, -1), invert=True)
@@ -268,8 +268,11 @@ def _compute_missed(session: Session, missed: Integers, columns: dict[str, Array
     logged.resume(0)
     controller, plant = logged.controller, session.plant
     controller.leave_out_law()
-    # a silent row repeats the levels of the frame before it
+    # a silent row repeats the levels of the frame before it, if no row between them is missing or left out
     framed = np.maximum.accumulate(np.where(plant["sent_as"] == Sent.FRAME, np.arange(len(plant)), -1))
+    gaps = [gap.last_tick for gap in session.missing if gap.end == "plant" and gap.rows and gap.last_tick is not None]
+    gaps_before = np.searchsorted(sorted([*gaps, *(one.last_tick for one in session.unknown)]), plant["session_tick"])
+    framed[gaps_before[framed] != gaps_before] = -1
     known = np.where(np.isnan(columns["q"][:, 0]), -1, np.arange(len(session.k)))
     before, followed = np.maximum.accumulate(known), -1
     for place in missed.tolist():
@@ -426,10 +429,11 @@ def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, t
     return wall, sent, _since(sent, answered), forward - offset, backward + offset, ends
 
 
-def _column(table: Table, places: Places, name: str) -> Integers:
+def _column(table: Table, places: Places, name: str) -> npt.NDArray[Any]:
     """A column's values at places of a table; −1 where the place is −1. Shape (n,)."""
-    values = np.append(table[name].astype(np.int64), -1)
-    return np.asarray(values[places])
+    values = table[name]
+    kind = np.int16 if values.itemsize == 1 else np.int64
+    return np.append(values.astype(kind), kind(-1))[places]
 
 
 def _since(begin: Integers, end: Integers) -> Array:
