@@ -117,14 +117,11 @@ def test_whatever_batches_are_lost_no_tick_is_computed_otherwise(
         found = getattr(known, name)
         same = (found == getattr(its, name)) | np.isnan(found)
         assert same.all(), (name, known.k[~same.all(axis=1)])
-    spans = [found for message in messages if (found := ends_of(message)) is not None]
-    recorded = {k for _, first, last in spans for k in range(first, last + 1)}
-    named = {
-        k
-        for first, last in [(one.first_tick, one.last_tick) for one in (*findings.unknown, *findings.missing)]
-        if last is not None
-        for k in range(first, last + 1)
-    }
+    batches = [found for message in messages if (found := ends_of(message)) is not None]
+    recorded = {k for _, first, last in batches for k in range(first, last + 1)}
+    spans = [(one.first_tick, one.last_tick) for one in findings.unknown]
+    spans += [(one.first_tick, one.last_tick) for one in findings.missing if one.last_tick is not None]
+    named = {k for first, last in spans for k in range(first, last + 1)}
     answered = range(int(known.k[-1]) + 1)
     assert recorded & set(answered) <= set(known.k.tolist()) | named
     assert not replay([log]).differs
