@@ -129,15 +129,13 @@ def records(
                 progress(at + size)
 
 
-def messages(
-    path: Path, wanted: Callable[[Channel], T | None], progress: Callable[[int], None] | None = None
-) -> Iterator[tuple[T, Message]]:
+def messages(path: Path, wanted: Callable[[Channel], T | None]) -> Iterator[tuple[T, Message]]:
     """Messages of some channels, each with what `wanted` returns for its channel; None skips the channel.
 
     Damage and errors are as of `records`.
     """
     answers: dict[int, T | None] = {}
-    for one in records(path, None, progress):
+    for one in records(path):
         if isinstance(one, Channel) and one.id not in answers:
             answers[one.id] = wanted(one)
         elif isinstance(one, Message) and (answer := answers.get(one.channel_id)) is not None:

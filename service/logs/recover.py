@@ -110,8 +110,9 @@ class McapCopy:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
         self.messages += 1
 
-    def schema(self, *what: *tuple[str, str, bytes]) -> int:
-        """Id of a schema in the new file, by its name, encoding and data."""
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Id of a schema in the new file."""
+        what = name, encoding, data
         if what not in self._ids:
             self._ids[what] = self._writer.register_schema(*what)
         return self._ids[what]

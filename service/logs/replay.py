@@ -218,7 +218,8 @@ def _replay_session(
             differ.append(i)
 
     computed_as, computed = np.frombuffer(sent_as, np.uint8), np.frombuffer(frames, f"V{wire.command.size}")
-    within = (rows["tick"] >= part_s[0] / period) & (rows["tick"] <= part_s[1] / period)
+    since, until = (at_s / session.settings.loop.period for at_s in part_s)
+    within = (rows["tick"] >= since) & (rows["tick"] <= until)
     answered, differ = (computed_as != Sent.NONE) & within, [i for i in differ if within[i]]
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
     after, _ = commanded(session, wire, computed_as, computed)
@@ -227,16 +228,15 @@ def _replay_session(
     difference, details = None, list[str]()
     if differ:
         first = differ[0]
-        was, now = (
-            bytes(frame) if kind == Sent.FRAME else Sent(int(kind)).name.lower()
-            for kind, frame in ((rows["sent_as"][first], rows["command"][first]), (sent_as[first], computed[first]))
+        tick, was_as, now_as = int(rows["tick"][first]), Sent(int(rows["sent_as"][first])), Sent(sent_as[first])
+        was, now = bytes(rows["command"][first]), bytes(computed[first])
+        difference = TickDifference(
+            tick=tick,
+            time_s=round(tick * period, 9),
+            logged=was.hex() if was_as == Sent.FRAME else was_as.name.lower(),
+            computed=now.hex() if now_as == Sent.FRAME else now_as.name.lower(),
         )
-        tick, (logged_text, text) = (
-            int(rows["tick"][first]),
-            (one.hex() if isinstance(one, bytes) else one for one in (was, now)),
-        )
-        difference = TickDifference(tick=tick, time_s=round(tick * period, 9), logged=logged_text, computed=text)
-        if isinstance(was, bytes) and isinstance(now, bytes):
+        if was_as == now_as == Sent.FRAME:
             signals = [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
             details = in_units(wire.command, signals, was, now)
         again = LoggedController(session, settings, ignored=ignored, resumes=not overrides)

@@ -23,7 +23,7 @@ from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
-from aeroloop.service.logs.table import TruthColumns, columns_of, euler_deg
+from aeroloop.service.logs.table import columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
@@ -145,7 +145,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
     law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
-    ticks, truth = Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros)
+    ticks, truth = Ticks(k, k, k, one, one, one, *law), np.zeros((3, 11))
     columns = columns_of((VEHICLE, SESSION), ticks, truth, load().model_copy(update={"wire": wire}))
     found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
     np.testing.assert_equal(
