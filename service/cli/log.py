@@ -117,6 +117,12 @@ def replay(
         Literal["controller", "plant"] | None,
         typer.Option("--end", help="Only this end; both if left out.", show_default=False),
     ] = None,
+    since_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Replay from this time on only.", show_default=False)
+    ] = None,
+    until_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Replay to this time only.", show_default=False)
+    ] = None,
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces and compare byte for byte; exit with 1 unless all of it is the same."""
@@ -125,8 +131,9 @@ def replay(
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import replay_table
 
+    times_s = _part(since_s, until_s, "--to")
     with guarded(), share_bar("replaying", hidden=json) as update:
-        replayed = replay(logs, overrides or [], update, ends=[end] if end else ENDS)
+        replayed = replay(logs, overrides or [], update, [end] if end else ENDS, *times_s)
     show(replayed, json, replay_table)
     if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)

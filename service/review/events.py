@@ -72,8 +72,8 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
         name = address.topic.name
         return address if name in _EVENTS or (name == "truth" and address.vehicle == which[0]) else None
 
-    for found in recording.messages(wanted):
-        address, at_ns = found.answer, found.publish_time
+    for address, found in recording.messages(wanted):
+        at_ns = found.publish_time
         name = address.topic.name
         try:
             if name == "truth":

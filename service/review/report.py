@@ -13,8 +13,7 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
-from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.session import Array, Missing
+from aeroloop.service.logs.session import Array, Missing, Unknown
 
 
 class Spread(BaseModel, frozen=True):

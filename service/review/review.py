@@ -17,9 +17,8 @@ from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.figures import Figures, figures
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import Missing, Session
+from aeroloop.service.logs.session import Missing, Session, Unknown
 from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
 from aeroloop.service.review.events import Happened, Messages, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing

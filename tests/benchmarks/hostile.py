@@ -212,7 +212,7 @@ def _a_batch(path: Path) -> bytes:
 
     make_log(path, 300)
     found = logged(path, lambda channel: True if "/trace/" in channel.topic else None)
-    return next(iter(found)).data
+    return next(found)[1].data
 
 
 PARTS: Final[dict[str, Callable[[Random], Failures]]] = {
