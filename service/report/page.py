@@ -20,7 +20,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from aeroloop.service.report.drawings import drawings, page_data, period_s
 from aeroloop.service.report.rows import (
     PERCENTILES,
-    THEOREM,
     count,
     durations,
     figure_rows,
@@ -52,11 +51,10 @@ def page(reports: Sequence[Report]) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"seconds": seconds, "micros": micros, "percent": percent, "shown": shown, "count": count}
-    environment.tests |= {"grave": grave, "known": lambda row: any(value.number is not None for value in row.values)}
+    environment.tests["grave"] = grave
     scripts = [get_plotlyjs(), (folder / "page.js").read_text(encoding="utf-8")]
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
     runs, drawn = [report.findings for report in reports], list(drawings(reports))
-    rows = figure_rows(runs)
     return environment.get_template("page.html").render(
         reports=reports,
         runs=list(enumerate(reports)),
@@ -66,8 +64,7 @@ def page(reports: Sequence[Report]) -> str:
         scripts=scripts,
         data=page_data(reports, drawn),
         drawings=drawn,
-        rows=[row for row in rows if not row.figure.key.startswith(THEOREM)],
-        theorem_rows=[row for row in rows if row.figure.key.startswith(THEOREM)],
+        rows=figure_rows(runs),
         differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),

@@ -66,7 +66,7 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
                     axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
             elif len(labels[0]) > 1:
                 figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
-            number = NUMBERS.get((name, case))
+            number = NUMBERS[case].get(name)
             paths += save(figure, folder, f"{number}-{name}" if number else name)
     return paths
 

@@ -15,7 +15,6 @@ from rich.text import Text
 
 from aeroloop.service.report.rows import (
     PERCENTILES,
-    THEOREM,
     count,
     durations,
     figure_rows,
@@ -76,11 +75,6 @@ def review_account(findings: Findings) -> None:
         for good, text in theorem_sentences(findings):
             style = {True: "green", False: "bold red"}.get(good, "") if good is not None else ""
             console.print(Text(text, style=style))
-        table = Table(show_header=False, box=None, pad_edge=False)
-        for figure, values, _ in figure_rows([findings]):
-            if figure.key.startswith(THEOREM) and values[0].number is not None:
-                table.add_row(figure.name, Text(values[0].text, justify="right"), figure.unit)
-        console.print(table)
     others = [entry for entry in since if not grave(entry[1])]
     if before or others:
         console.print()

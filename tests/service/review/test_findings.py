@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.review.report import Check, Findings, Spread
-from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.requirements import Limit, value_of
 from aeroloop.service.review.review import read, review
 from aeroloop.service.terminal.log_tables import sparkline
 from tests.service.review.conftest import TICKS
@@ -266,7 +266,7 @@ def test_short_names_of_limits_mean_what_they_say(whole: Path) -> None:
         "skipped": 3, "gaps": 2, "losses": 7, "latency.p99": 4.0, "period.p999": 5.0, "age.max": 3.0,
         "saturated.voltage": 0.25, "invalid": 9, "trips": 1,
     }  # fmt: skip
-    assert {name: Limit.parse(f"{name}=0").value(findings) for name in values} == values
+    assert {name: value_of(findings, Limit.parse(f"{name}=0").path) for name in values} == values
 
 
 def test_a_missing_figure_breaks_its_limit_and_states_why(whole: Path) -> None:
