@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from aeroloop.service.report.drawings import drawings, page_data, period_s
+from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.report.rows import (
     PERCENTILES,
     count,
@@ -74,7 +74,6 @@ def page(reports: Sequence[Report]) -> str:
         percentiles=[f"{name}#" for name in PERCENTILES.values()],
         judgement=judgement,
         largest_error=largest_error,
-        period_s=period_s,
         thinned=max(reports, key=lambda report: report.thinned),
     )
 

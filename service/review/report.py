@@ -224,6 +224,12 @@ class Report:
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     part: tuple[float, float] | None = None
 
+    @property
+    def period_s(self) -> float | None:
+        """The loop's period [s], as configured; None if the log does not have it."""
+        rate = self.settings.get("loop", {}).get("rate_hz")
+        return 1 / rate if rate else None
+
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested tables as one, with dotted keys: `{"law": {"C2": 1}}` is `{"law.C2": 1}`."""

@@ -17,7 +17,6 @@ from aeroloop.service.cli.compare import write_html
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.report.page import page
-from aeroloop.service.report.rows import figure_rows, micros, percent
 from aeroloop.service.review.report import Check, Line, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, made_report, made_theorem
 
@@ -118,18 +117,6 @@ def test_what_cannot_be_judged_is_one_line_with_its_reasons() -> None:
         assert {line, "Nothing could be judged."} <= set(texts)
 
 
-def test_the_wire_is_listed_with_the_quantizer_of_each_signal() -> None:
-    signals = {
-        "attitude": {"bits": 8, "limit": 1.0, "kind": "uniform"},
-        "rate": {"bits": 10, "limit": 2.0, "kind": "hysteresis-uniform"},
-        "voltage": {"bits": None, "limit": 24.0, "kind": "logarithmic-uniform"},
-    }
-    run = made_report(settings={"wire": signals})
-    assert after("attitude ε", 4, run) == ["uniform", "8", "±1", "0"]
-    assert after("rate ω", 4, run) == ["hysteresis-uniform", "10", "±2", "1.3"]
-    assert after("voltage u", 3, run) == ["–", "cont", "±24"]
-
-
 def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_and_which_part_is_drawn() -> None:
     damage = "a.mcap: cut at byte 1234"
     assert damage in texts_of(made_report(damages=[damage]))
@@ -168,12 +155,6 @@ def test_a_comparison_states_differences_to_the_first_run_in_words() -> None:
     assert after("largest attitude error", 4, *longer)[3] == "▼ better"
 
 
-def test_a_missing_figure_states_why() -> None:
-    why = "the plant reported no latency"
-    run = with_findings(made_report(), latency_us=None, reasons={"latency_us": why})
-    assert texts_of(run).count(why) >= 2  # p50 and p99
-
-
 def test_every_tick_is_in_the_data_and_a_text_in_it_cannot_end_its_script() -> None:
     report = replace(
         made_report(), panels=[Panel("input", HOSTILE, HOSTILE, HOSTILE, [Line(HOSTILE, np.arange(501.0))])]
@@ -210,11 +191,3 @@ def test_a_run_without_values_has_a_page_and_one_log_may_be_compared_with_itself
 def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"cannot write .*: No such file or directory"):
         write_html([made_report()], tmp_path / "none" / "page.html", [], force=False)
-
-
-def test_numbers_have_sensible_digits() -> None:
-    durations = ("0.25 µs", "42.4 µs", "640 µs", "2.4 ms", "1.25 s")
-    assert tuple(map(micros, (0.25, 42.4, 640.2, 2400, 1.25e6))) == durations
-    assert [percent(share) for share in (0, 0.00012, 0.0345, 1)] == ["0", "0.012", "3.5", "100.0"]
-    (z_track,) = (row for row in figure_rows([made_report().findings]) if row.figure.key == "z_track")
-    assert (z_track.values[0].text, z_track.figure.unit) == ("45.80", "×10⁻⁴ s")

@@ -17,8 +17,8 @@ from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.review.report import Check, Findings, Spread
-from aeroloop.service.review.requirements import Limit, value_of
-from aeroloop.service.review.review import read, review
+from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.review import read
 from aeroloop.service.terminal.log_tables import sparkline
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
@@ -225,16 +225,6 @@ def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tm
 # The whole
 
 
-def test_findings_are_the_figures_and_more(whole: Path) -> None:
-    figures, findings = review(whole), found(whole)
-    assert {name: getattr(findings, name) for name in type(figures).model_fields if name != "reasons"} == {
-        name: getattr(figures, name) for name in type(figures).model_fields if name != "reasons"
-    }
-    assert figures.reasons.items() <= findings.reasons.items()
-    assert (findings.vehicle, findings.session, findings.sessions) == ("aero", "s1", 1)
-    assert findings.started == "2027-01-15T08:00:00.000+00:00"
-
-
 def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
     facts = {"git": "abc", "cpu": "two cores"}
     path = rewrite(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
@@ -247,32 +237,6 @@ def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(w
         Check(text="skipped ≤ 0", holds=True, found="0"),
         Check(text="latency.p99 ≤ 100 µs", holds=False, found="300 µs"),
     ]
-
-
-def test_short_names_of_limits_mean_what_they_say(whole: Path) -> None:
-    clean = found(whole)
-    timing = {
-        "latency": clean.timing["latency"].model_copy(update={"p99": 4.0}),
-        "period": clean.timing["period"].model_copy(update={"p999": 5.0}),
-    }
-    findings = clean.model_copy(
-        update={
-            "skipped_ticks": 3, "gap_count": 2, "losses": {"event": 5, "truth": 2}, "timing": timing, "trips": ["x"],
-            "age_us": {"p50": 1.0, "p99": 2.0, "max": 3.0}, "saturated": {"voltage": 0.25},
-            "invalid": {"measurement": 4, "command": 5},
-        }
-    )  # fmt: skip
-    values = {
-        "skipped": 3, "gaps": 2, "losses": 7, "latency.p99": 4.0, "period.p999": 5.0, "age.max": 3.0,
-        "saturated.voltage": 0.25, "invalid": 9, "trips": 1,
-    }  # fmt: skip
-    assert {name: value_of(findings, Limit.parse(f"{name}=0").path) for name in values} == values
-
-
-def test_a_missing_figure_breaks_its_limit_and_states_why(whole: Path) -> None:
-    check = Limit.parse("age.p99=5000").check(found(whole))
-    assert not check.holds
-    assert "controller" in check.found
 
 
 def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:

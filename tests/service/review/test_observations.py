@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
-from aeroloop.service.review.observations import gaps, saturation, spread
+from aeroloop.service.review.observations import gaps, spread
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import LOCKSTEP, read
 from tests.service.review.conftest import TICKS
@@ -135,9 +134,3 @@ def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Pat
     findings = found(tmp_path / "a.mcap")
     assert findings.invalid == {"measurement": 7, "command": 7}
     assert (findings.gap_count, findings.skipped_ticks) == (0, 0)
-
-
-def test_without_quantization_a_value_at_the_limit_is_saturated() -> None:
-    wire = load(overrides=[f"wire.{name}.bits=cont" for name in ("attitude", "rate", "voltage")]).wire
-    commands = np.array([[volts, 1.0] for volts in (24.0, -24.0, 23.9, nan)])
-    assert saturation(wire, np.empty((0, 6)), commands) == ({"voltage": 2 / 7}, {"measurement": 0, "command": 1})

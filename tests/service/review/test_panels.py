@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aeroloop.protocol.messages.models import Truth
 from aeroloop.service.config import load
 from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.ticks import Ticks
@@ -19,8 +18,7 @@ from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import check_theorem
 from tests.service.review.conftest import TICKS
 from tests.support.decoded import product
-from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest, message_of, rewrite
-from tests.support.made_log import SESSION, START_NS
+from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest
 
 NO_TRUTHS = Truths(np.empty(0, dtype=np.int64), np.empty((0, 4)), np.empty((0, 3)))
 
@@ -107,25 +105,6 @@ def test_a_part_is_all_that_is_read_and_the_findings_say_so(whole: Path) -> None
     assert {mark.time_s for mark in found.marks} == {None}  # the session's first gains and reference, before it
     with pytest.raises(ReviewError, match="there is nothing from 2 s to 3 s: the session has 1 s"):
         read(whole, since_s=2, until_s=3)
-
-
-def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_path: Path) -> None:
-    """The truth, sent at every tenth tick, is the desired attitude turned by 10°: the angle between them is that."""
-    turn = cos(radians(5)), 0.0, sin(radians(5)), 0.0
-    ticks = read(whole).ticks
-    more = [
-        message_of(
-            "truth",
-            Truth(tick=k, session=SESSION, session_tick=k, attitude=product(tuple(desired), turn), rate=(0, 0, 0),
-                  voltages=(0, 0)),
-            START_NS + k * PERIOD_NS + 1000,
-        )
-        for k, desired in list(zip(ticks.k.tolist(), ticks.desired.tolist(), strict=True))[::10]
-    ]  # fmt: skip
-    made = read(rewrite(whole, tmp_path / "a.mcap", more=more)).report()
-    (panel,) = (panel for panel in made.panels if panel.group == "error_angle")
-    assert [line.label for line in panel.lines] == ["measured", "true"]
-    assert panel.lines[1].values[1:-10] == pytest.approx(10.0, abs=0.05)  # interpolated while q_d turns
 
 
 def test_the_true_error_is_that_of_the_law_however_far_the_body_is_turned() -> None:
