@@ -7,14 +7,10 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from json import loads
 from math import inf
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
-from aeroloop.service.cli.compare import write_html
-from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.report.page import page
 from aeroloop.service.review.report import Check, Line, Panel, Report
@@ -186,8 +182,3 @@ def test_a_run_without_values_has_a_page_and_one_log_may_be_compared_with_itself
     assert "Nothing to judge" in texts_of(with_findings(bare, timing={}, gaps=[], gap_count=0, z_track=None))
     with_theorem = made_report(theorem=made_theorem())
     assert "2 runs compared" in texts_of(with_theorem, replace(with_theorem))
-
-
-def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"cannot write .*: No such file or directory"):
-        write_html([made_report()], tmp_path / "none" / "page.html", [], force=False)

@@ -163,13 +163,6 @@ def test_events_gaps_and_keys_move_the_time_that_is_shown(one: Page) -> None:
     assert one.locator("#shown").inner_text() == "−0.1 – 10.1 s"
 
 
-def test_the_search_opens_what_it_finds(one: Page) -> None:
-    one.locator("#search").fill("rate_hz")
-    assert one.locator("#configuration tr[data-key]:visible").all_inner_texts() == ["rate_hz\t500.0"]
-    one.locator("#search").fill("")
-    assert one.locator("#configuration tr[data-key]:visible").count() == 0
-
-
 CONTRASTS = """() => {
     const probe = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
     const rgb = (colour) => {
@@ -278,7 +271,7 @@ def test_no_link_of_the_navigation_is_cut_off_and_nothing_scrolls_sideways_on_a_
         const { left, right } = link.getBoundingClientRect();
         return [left, right];
     })""")
-    assert len(edges) >= 8
+    assert len(edges) >= 6
     assert all(left >= 0 and right <= width for left, right in edges)
     nav = "(() => { const nav = document.querySelector('nav'); return nav.scrollWidth <= nav.clientWidth; })()"
     assert two.evaluate(nav)

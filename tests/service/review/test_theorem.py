@@ -313,13 +313,6 @@ def test_the_true_line_goes_from_one_published_state_to_the_next_and_begins_with
     assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
 
 
-def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
-    for plant, V in (("plant.ideal=true", (0.0071**2 + 0.022**2) / 0.02 / 2), ("plant.via=quanser", 0.0)):
-        found = trial(at_rest([0]), truths_at(0), plant=plant)
-        assert float(found.true[1, 0]) == pytest.approx(V)
-        assert found.damping_known == (V > 0)
-
-
 def test_the_bound_is_drawn_until_gains_or_reference_change() -> None:
     settings, ticks = load(overrides=["reference.kind=hold"]), at_rest(range(0, 20_000, 100))
     changes = [FIRST, change(16_000, gains=Gains(), reference=Hold())]
