@@ -54,11 +54,14 @@ class Review:
     facts: dict[str, dict[str, Any]]
     part: tuple[float, float] | None
 
+    def checked(self, limits: Sequence[Limit] = ()) -> Findings:
+        """The findings, checked against limits."""
+        return self.findings.model_copy(update={"checks": [limit.check(self.findings, limits) for limit in limits]})
+
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
         time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
-        checks = [limit.check(self.findings, limits) for limit in limits]
-        findings, settings = self.findings.model_copy(update={"checks": checks}), self.settings.description()
+        findings, settings = self.checked(limits), self.settings.description()
         return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import load
-from aeroloop.service.logs.export import export
 from aeroloop.service.review.observations import gaps, spread
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import LOCKSTEP, read
@@ -84,9 +82,6 @@ def test_in_lockstep_there_is_no_latency_and_no_age_and_the_reason_is_stated(tmp
     for name in ("latency_us", "age_us", "timing.latency", "timing.period", "clock_offset_us"):
         assert findings.reasons[name] == LOCKSTEP
     assert not {"latency", "period"} & {panel.group for panel in read(tmp_path / "a.mcap").report().panels}
-    export([tmp_path / "a.mcap"], "csv", tmp_path / "a.csv")
-    rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()))
-    assert {row[name] for row in rows for name in ("latency_us", "measurement_delay_us", "command_delay_us")} == {""}
 
 
 def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: Path, tmp_path: Path) -> None:
