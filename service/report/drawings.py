@@ -218,7 +218,8 @@ def _desired_agree(alike: Alike, reports: Sequence[Report]) -> bool:
     visible = 0.02 * max(map(abs, _extent(alike)))
     for time, values in desired[1:]:
         apart = np.abs(values - np.interp(time, *desired[0], left=nan, right=nan))
-        if not (apart[np.isfinite(apart)].max(initial=-1.0) <= visible) or np.isnan(apart).all():
+        apart = apart[np.isfinite(apart)]
+        if not len(apart) or apart.max() > visible:
             return False
     return not desired or len(desired) == len(alike) == len(reports)
 

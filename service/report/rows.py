@@ -119,6 +119,7 @@ FIGURES: Final = (
     Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
             "angle from measured to desired attitude"),
     Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
+    Figure("second_half_error_deg", "largest attitude error in the second half", "°", _hundredth),
     Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
     Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
     Figure("latency_us.p99", "loop latency p99", "µs", _whole),
@@ -212,8 +213,9 @@ def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
         judged.append(f"Judged until {found.until_s:g} s, where gains or reference changed.")
     if found.samples:
         unmet = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
-        by = f"the other {found.judged:,}" if unmet else "all of them"
-        judged += [f"{found.samples:,} true states belong to a tick.", *unmet, f"Lemma 1 is judged by {by}."]
+        judged += [f"{found.samples:,} true states belong to a tick.", *unmet]
+        if found.judged:
+            judged.append(f"Lemma 1 is judged by {f'the other {found.judged:,}' if unmet else 'all of them'}.")
     if found.broken:
         which = ", ".join(f"({check.equation}) {check.broken:,}×" for check in found.lemma if check.broken)
         judged.append(f"It is broken: {which}.")

@@ -111,6 +111,7 @@ def test_what_cannot_be_judged_is_one_line_with_its_reasons() -> None:
         why = dict(zip(("theorem.broken", "theorem.pointwise_share"), reasons, strict=True))
         texts = texts_of(with_findings(made_report(theorem=theorem), reasons=why))
         assert {line, "Nothing could be judged."} <= set(texts)
+        assert not any("is judged by" in text for text in texts)
 
 
 def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_and_which_part_is_drawn() -> None:
