@@ -88,17 +88,16 @@ def review(
     with guarded():
         with share_bar("reading", hidden=json) as update:
             judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=begin_s, until_s=end_s)
-        report = judged.report(limits)
         if figures is not None:
             from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(report, judged.settings, folder)
+                drawn = draw_figures(judged.report(), judged.settings, folder)
             names = ", ".join(dict.fromkeys(path.stem for path in drawn))
             typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:
-            write_html([report], html, logs, force)
-        findings = report.findings
+            write_html([judged.report(limits)], html, logs, force)
+    findings = judged.checked(limits)
     show(findings, json, review_account)
     if broken := broken_limits(findings):
         fail("; ".join(broken), 1)

@@ -15,9 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, Damage, messages, with_checksum
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, Damage, records, with_checksum
 from aeroloop.service.logs.recover import recover
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
@@ -96,7 +97,9 @@ def payload(number: int) -> bytes:
 
 def numbers(path: Path, damages: list[Damage] | None = None) -> list[int]:
     """Of the messages in a file, also in one without index, all as they were given."""
-    found = list(messages(path, lambda channel: channel.topic == KEY or None, damages))
+    read = list(records(path, damages))
+    ours = {one.id for one in read if isinstance(one, Channel) and one.topic == KEY}
+    found = [one for one in read if isinstance(one, Message) and one.channel_id in ours]
     for one in found:
         at_ns = START_NS + one.sequence * 1_000_000
         assert (one.data, one.publish_time, one.log_time) == (payload(one.sequence), at_ns, at_ns + 77)
