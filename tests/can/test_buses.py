@@ -7,8 +7,6 @@ two cores, where a process may wait for hundreds of milliseconds.
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -27,9 +25,8 @@ from aeroloop.service.config import load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.fork_server import fork_server
 from aeroloop.service.testing.hil import Hil, HilError, HilLog
-from aeroloop.service.testing.process_group import free_rendezvous
+from aeroloop.service.testing.process_group import free_rendezvous, start_command
 from tests.support.slcan_adapter import SlcanAdapter
 
 AEROLOOP: Final = [sys.executable, "-P", "-m", "aeroloop"]
@@ -67,21 +64,19 @@ class Node:
         config.write_text(hil.settings.toml())
         self._said = folder / "node.stderr"
         sets = [argument for override in overrides for argument in ("--set", override)]
-        with self._said.open("wb") as stderr:
-            words = ["can-node", "--config", str(config), *sets]
-            self._process = fork_server().start(words, os.environ, stderr.fileno())
+        self._process = start_command(["can-node", "--config", str(config), *sets], self._said)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.send_signal(signal.SIGTERM)
-        self._process.wait(30)
+        self._process.terminate()
+        self._process.join(30)
 
     @property
     def said(self) -> str:
         """Its stderr so far."""
-        return self._said.read_text()
+        return self._said.read_text() if self._said.exists() else ""
 
 
 class Loop:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aeroloop.service.cli.compare import write_html
+from aeroloop.service.cli.log import write_html
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.report.page import page
