@@ -207,7 +207,7 @@ def live(
     vehicle = settings.vehicle
 
     def ready(url: str) -> None:
-        layout = f"aeroloop show layout --vehicle {vehicle}"
+        layout = f"aeroloop show layout --set vehicle={vehicle}"
         typer.echo(f"{vehicle} at {url} for Foxglove and Lichtblick, until ^C; `{layout}` prints a layout to import")
 
     def run(stop: Event) -> None:

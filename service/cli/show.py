@@ -52,15 +52,9 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
-def layout(
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle to show; the configured one if left out.")
-    ] = None,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
+def layout(config: Config = None, overrides: Overrides = None) -> None:
     """Print a layout for Foxglove or Lichtblick. It shows a log or `log live`."""
-    settings = settings_of(config, overrides, *([f'vehicle="{vehicle}"'] if vehicle is not None else []))
+    settings = settings_of(config, overrides)
 
     from aeroloop.service.viewers.layout import layout as describe
 

@@ -19,6 +19,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from random import randrange
+from runpy import run_module
 from threading import Condition, Thread
 from typing import Any, Final, Literal, Self, get_args
 
@@ -103,10 +104,8 @@ def _run_command(words: list[str], output: Path, environment: Mapping[str, str],
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # in the thread, which handles none
     Thread(target=_follow_parent, daemon=True).start()
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    from aeroloop.service.cli import entry
-
     sys.argv[1:] = words
-    entry.main()
+    run_module("aeroloop", run_name="__main__")
 
 
 def _follow_parent() -> None:
