@@ -39,6 +39,7 @@ Vehicle = Annotated[
     typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.", show_default=False),
 ]
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
+Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
 
 group = typer.Typer()
 
@@ -51,7 +52,7 @@ def review(
         typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
     ] = None,
     since_s: Since = -inf,
-    until_s: Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)] = inf,
+    until_s: Until = inf,
     require: Require = None,
     session: Annotated[
         str | None,

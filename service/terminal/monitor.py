@@ -1,7 +1,7 @@
 """Live view of the network, `op top`: every role of every vehicle, from its published messages.
 
-Subscribes to status, telemetry, truth and events, and queries descriptions, which hold the wire. What is shown is true
-now: values of a session that has ended are left out, and what was not received for `SILENT_S` is marked with its age.
+Subscribes to status, telemetry, truth and events. What is shown is true now: values of a session that has ended are
+left out, and what was not received for `SILENT_S` is marked with its age.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import degrees, inf
+from math import degrees
 from typing import Final
 
 import zenoh
@@ -28,18 +28,15 @@ from rich.live import Live
 from rich.text import Text
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import Event, Status, Telemetry, Truth
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle, to_euler
-from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.health import SILENT_S
 from aeroloop.service.terminal.roles import STALE, WAITING, duration, roles_view
 
 REFRESH_S: Final = 0.2
 EVENTS: Final = 5
-APART_S: Final = 0.5
-"""Least time between two statuses for a rate; closer ones count too few frames [s]."""
 
 
 @dataclass
@@ -49,10 +46,6 @@ class Vehicle:
     statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
     telemetry: tuple[float, Telemetry] | None = None
     truth: tuple[float, Truth] | None = None
-    settings: Settings | None = None
-    counted: Status | None = None
-    frames_per_s: tuple[float, float] | None = None
-    """Measurements and commands a second, between two statuses of the controller."""
 
 
 class Top:
@@ -74,22 +67,17 @@ class Top:
             try:
                 match address.topic.name:
                     case "status" if address.role is not None:
-                        status = Status.model_validate_json(payload)
-                        vehicle.statuses[address.role] = self._clock(), status
-                        if address.role == "controller":
-                            _count(vehicle, status)
+                        vehicle.statuses[address.role] = self._clock(), Status.model_validate_json(payload)
                     case "telemetry":
                         vehicle.telemetry = self._clock(), Telemetry.model_validate_json(payload)
                     case "truth":
                         vehicle.truth = self._clock(), Truth.model_validate_json(payload)
-                    case "description" if address.role in ("plant", "controller"):
-                        vehicle.settings = from_description(Description.model_validate_json(payload).config)
                     case "event":
                         event = Event.model_validate_json(payload)
                         self._events.append(
                             f"{time.strftime('%H:%M:%S')} {address.vehicle} {address.role}: {event.text}"
                         )
-            except (ValidationError, ConfigError):
+            except ValidationError:
                 pass  # of another version; its other messages may still parse
 
     def draw(self, width: int) -> Group:
@@ -105,17 +93,8 @@ class Top:
             return Group(*blocks, *(Text(event) for event in self._events))
 
 
-def _count(vehicle: Vehicle, status: Status) -> None:
-    before = vehicle.counted
-    passed_s = status.uptime_s - before.uptime_s if before is not None else 0.0
-    if before is not None and passed_s >= APART_S:
-        vehicle.frames_per_s = (status.received - before.received) / passed_s, (status.sent - before.sent) / passed_s
-    if before is None or passed_s >= APART_S or passed_s < 0:  # negative: the controller was restarted
-        vehicle.counted = status
-
-
 def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[Text]:
-    """Attitude, error, voltages and payload, as far as they are those of now."""
+    """Attitude, error and voltages, as far as they are those of now."""
     if vehicle.truth is not None:
         at, truth = vehicle.truth
         roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
@@ -136,12 +115,6 @@ def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now:
     else:
         yield Text(f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°")
         yield Text("voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V")
-    if vehicle.settings is not None and "controller" in statuses:
-        wire, rate_hz = vehicle.settings.wire, statuses["controller"][1].rate_hz
-        measured, commanded = vehicle.frames_per_s or (rate_hz, rate_hz)
-        up = 8e-3 * wire.measurement.size * (measured if wire.transmit.measurement == "on_change" else rate_hz)
-        down = 8e-3 * wire.command.size * (commanded if wire.transmit.command == "on_change" else rate_hz)
-        yield Text(f"payload {up:.1f} + {down:.1f} kbit/s")
 
 
 def watch(network: NetworkSettings) -> None:
@@ -167,14 +140,9 @@ def watch(network: NetworkSettings) -> None:
         session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
-        queried = -inf
-        while True:
-            if time.monotonic() - queried > 2.0:  # for roles that have joined since
-                queried = time.monotonic()
-                session.get(topics.key("description", "*"), answered, timeout=1.0)
+        live.update(top.draw(console.width), refresh=True)
+        while "q" not in wait_for_keys(REFRESH_S):
             live.update(top.draw(console.width), refresh=True)
-            if "q" in wait_for_keys(REFRESH_S):
-                return
 
 
 @contextmanager

@@ -70,9 +70,8 @@ def _row(role: str, age: float, status: Status) -> Row:
         "rate 1/s": f"{status.rate_hz:.0f}",
         "skipped ticks": str(status.skipped),
         "latency p50/p99 µs": p50_p99(status.latency_us),
-        "up": duration(status.uptime_s),
         "answers in p50/p99 µs": p50_p99(status.age_us),
-        "wake-up p50/p99 µs": p50_p99(status.timing.recent_wake if status.timing else None),
+        "up": duration(status.uptime_s),
     }
 
 

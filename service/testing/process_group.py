@@ -75,7 +75,8 @@ def start_command(words: Sequence[str], output: Path, environment: Mapping[str, 
     process: BaseProcess = context.Process(
         target=_run_command, args=([*words], output, given, os.getcwd()), daemon=True
     )
-    with _environment(environment or {}):
+    # NumPy would start threads at its import, before the command blocks the signals that its own thread waits for.
+    with _environment({"OPENBLAS_NUM_THREADS": "1", **(environment or {})}):
         process.start()
     return process
 

@@ -173,9 +173,9 @@ def assert_tracks(figures: Figures, alone: Figures) -> None:
     assert figures.final_error_deg < alone.final_error_deg + 0.5
 
 
-@pytest.mark.parametrize("command", ["can-node", "bridge"])
+@pytest.mark.parametrize("command", ["can-node", "plant"])
 def test_a_spec_that_does_not_fit_the_bus_is_refused_at_start_in_one_line(command: str) -> None:
-    sets = ["wire.rate.bits=13", f"network.rendezvous={free_rendezvous()}", "can.options.hop_limit=0"]
+    sets = ["wire.rate.bits=13", f"network.rendezvous={free_rendezvous()}", "can.options.hop_limit=0", "plant.via=can"]
     done = subprocess.run(
         [*AEROLOOP, command, *(argument for override in sets for argument in ("--set", override))],
         capture_output=True,

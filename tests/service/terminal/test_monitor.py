@@ -9,17 +9,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from aeroloop.protocol.messages.models import (
-    PROTOCOL_VERSION,
-    Description,
-    Event,
-    Percentiles,
-    Status,
-    Telemetry,
-    Truth,
-)
+from aeroloop.protocol.messages.models import Event, Percentiles, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message
-from aeroloop.service.config import load
 from aeroloop.service.host.health import SILENT_S
 from aeroloop.service.terminal.monitor import Top, keyboard
 
@@ -60,11 +51,6 @@ def driven(**more: Message) -> View:
     return View(**roles, telemetry=TELEMETRY, **more)
 
 
-def described(*overrides: str) -> Description:
-    config = load(overrides=overrides).description()
-    return Description(protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config)
-
-
 def test_every_role_of_every_vehicle_is_shown_with_its_state_and_a_missing_one_is_named() -> None:
     assert "no role" in View().text()
     view = driven()
@@ -75,23 +61,13 @@ def test_every_role_of_every_vehicle_is_shown_with_its_state_and_a_missing_one_i
     assert "no plant" not in shown
 
 
-def test_attitude_error_volts_bits_and_events_are_shown() -> None:
+def test_attitude_error_volts_and_events_are_shown() -> None:
     half = 2**-0.5
     truth = Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0))
     event = Event(role="recorder", kind="tripped", text="no fresh command for 100 ms: 0 V")
-    shown = driven(description__plant=described(), truth=truth, event__plant=event).text()
-    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 12.0 kbit/s", "aero plant: no fresh"):
+    shown = driven(truth=truth, event__plant=event).text()
+    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "aero plant: no fresh"):
         assert words in shown
-
-
-def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were() -> None:
-    view = View(description__plant=described("wire.transmit.command=on_change"))
-    for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
-        view.receive(status__controller=status("controller", "running", uptime_s=uptime_s, sent=sent))
-    assert "28.0 + 4.8 kbit/s" in view.text()  # 500 measurements of 7 bytes, 200 commands of 3
-    for uptime_s, sent in ((0.5, 3), (1.5, 103)):  # started anew, and so are its counts
-        view.receive(status__controller=status("controller", "running", uptime_s=uptime_s, sent=sent))
-    assert "28.0 + 2.4 kbit/s" in view.text()
 
 
 def test_error_and_voltages_of_a_session_that_is_over_are_not_shown() -> None:
@@ -131,7 +107,7 @@ def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
 
 def test_what_is_not_understood_is_left_out() -> None:
     view = driven()
-    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "aeroloop/aero/description/plant", "else"):
+    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "else"):
         view.top.receive(key, b'{"not": "a message"}')
     assert "+12.5" in view.text()
 
