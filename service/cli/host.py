@@ -85,8 +85,8 @@ def units(
 
 @keys.command()
 def init(
-    directory: Annotated[Path | None, typer.Argument(metavar="[DIR]", help="Folder.", show_default=False)] = None,
     days: Annotated[int, typer.Option(min=1, max=36500, help="How long the authority is valid, in days.")] = 3650,
+    directory: Directory = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:

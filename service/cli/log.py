@@ -255,6 +255,15 @@ def export(
 
     _check_part(since_s, until_s, "--until")
     with guarded(), share_bar("exporting", hidden=json) as update:
-        choice = {"session": session, "vehicle": vehicle, "since_s": since_s, "until_s": until_s}
-        exported = export(logs, to, out, **choice, force=force, progress=update)  # type: ignore[arg-type]
+        exported = export(
+            logs,
+            to,
+            out,
+            session=session,
+            vehicle=vehicle,
+            since_s=since_s,
+            until_s=until_s,
+            force=force,
+            progress=update,
+        )
     show(exported, json, account)

@@ -69,7 +69,7 @@ def run_demo(
                 raise HilError(f"no session began within {CLAIM_WAIT_S:g} s ({processes.states}); try again")
             show("" if processes.telemetry else "the first command", processes)
         processes.check()
-        show("the last statuses, and the review of the log", processes)
+        show("the review of the log", processes)
     return DemoFigures.of(parts(path)), not interrupted.is_set()
 
 

@@ -120,7 +120,8 @@ def live_demo(settings: Settings, total_s: float) -> Iterator[Callable[[str, Pro
 
         def update(waiting_for: str, now: ProcessGroup) -> None:
             if waiting_for or now.telemetry is None:
-                live.update(f"waiting for {waiting_for}{now.states and f' ({now.states})'}", refresh=True)
+                states = f" ({now.states})" if now.states and now.telemetry is None else ""
+                live.update(f"waiting for {waiting_for}{states}", refresh=True)
                 return
             bar.update(task, completed=now.telemetry.tick * settings.loop.period)
             figures = [
