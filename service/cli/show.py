@@ -56,7 +56,7 @@ def layout(config: Config = None, overrides: Overrides = None) -> None:
     """Print a layout for Foxglove or Lichtblick. It shows a log or `log live`."""
     settings = settings_of(config, overrides)
 
-    from aeroloop.service.viewers.layout import layout as describe
+    from aeroloop.service.viewers.schemas import layout as describe
 
     typer.echo(describe(settings.vehicle, settings.wire.motors))
 
