@@ -51,7 +51,7 @@ def certify(
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.terminal.certificate_table import certificate_sheets
+    from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.terminal.show import show_result
     from aeroloop.service.theorem.any_law import certify_any
 

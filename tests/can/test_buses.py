@@ -66,9 +66,9 @@ def test_in_lockstep_the_figures_are_those_of_the_experiment_to_the_last_bit(
     assert figures.trips == []
 
 
-@pytest.mark.parametrize("command", ["can-node", "bridge"])
+@pytest.mark.parametrize("command", ["can-node", "plant"])
 def test_a_spec_that_does_not_fit_the_bus_is_refused_at_start_in_one_line(command: str) -> None:
-    sets = ["wire.rate.bits=13", f"network.rendezvous={free_rendezvous()}", "can.options.hop_limit=0"]
+    sets = ["wire.rate.bits=13", f"network.rendezvous={free_rendezvous()}", "can.options.hop_limit=0", "plant.via=can"]
     done = subprocess.run(
         [*AEROLOOP, command, *(argument for override in sets for argument in ("--set", override))],
         capture_output=True,

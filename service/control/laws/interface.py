@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -160,10 +160,14 @@ class PythonLaw(Law[T]):
 # ── the body of a law's settings ──
 
 
-def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
-    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""
+def gravity_torque(p: LawSettings, q: X) -> X:
+    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,).
+
+    Of an expression it is an expression, of an array an array.
+    """
     weight = ca.vertcat(0, 0, -p.mass * p.gravity)
-    return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
+    torque = S(ca.SX(p.centre_of_mass)) @ R(ca.SX(cast(Any, q))).T @ weight
+    return cast(X, np.asarray(ca.evalf(torque)).ravel() if isinstance(q, np.ndarray) else torque)
 
 
 def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:

@@ -20,7 +20,7 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.terminal.certificate_table import certificate_sheets
+from aeroloop.service.terminal.sheets import certificate_sheets
 from aeroloop.service.terminal.show import show_all
 from aeroloop.service.theorem.bounds import attitude_error
 from aeroloop.service.theorem.certificate import certify

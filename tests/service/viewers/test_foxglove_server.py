@@ -212,7 +212,7 @@ def test_the_command_prints_its_address_and_stops_on_a_signal(settings: Settings
         assert process.stdout is not None
         try:
             line = process.stdout.readline()
-            assert "aeroloop show layout --vehicle aero" in line
+            assert "aeroloop show layout --set vehicle=aero" in line
             url = next(word for word in line.split() if word.startswith("ws://127.0.0.1:"))
             with Viewer(url) as viewer:
                 viewer.await_topics("/aero/pose")

@@ -69,14 +69,14 @@ def test_voltages_are_those_of_the_motors_there_are() -> None:
 
 
 def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytest.CaptureFixture[str]) -> None:
-    assert execute(["show", "layout", "--vehicle", "bench", "--set", "wire.actuators=3"]) == 0
+    assert execute(["show", "layout", "--set", "vehicle=bench", "--set", "wire.actuators=3"]) == 0
     assert json.loads(capfd.readouterr().out) == made("bench", 3)
     assert execute(["show", "layout", "--set", "vehicle=aero2"]) == 0
     assert json.loads(capfd.readouterr().out) == made("aero2")
 
 
 def test_a_name_that_no_vehicle_can_have_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
-    assert execute(["show", "layout", "--vehicle", "a/b"]) == 2
+    assert execute(["show", "layout", "--set", "vehicle=a/b"]) == 2
     captured = capfd.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("aeroloop: vehicle: ")
