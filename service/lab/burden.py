@@ -1,4 +1,4 @@
-"""Burden of a loop: error against bits over a grid of bits, quantizers, transmit policies and sensors.
+"""`lab burden`: error against bits over a grid of bits, quantizers, transmit policies and sensors.
 
 Each cell is one lockstep experiment. Both policies give the same run to the last bit, because an end that receives no
 frame holds its last levels; so a cell runs once, and its codes give the traffic of both. Every figure is compared with
@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, Final, NamedTuple, get_args
+from math import log10
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -30,8 +32,11 @@ from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Floats, Integers, StreamFigures
 from aeroloop.service.lab.experiment import LoopEndedError, experiment, heartbeat_of, sent_ticks
-from aeroloop.service.lab.sweep import Progress, Row, Sheets
-from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
+from aeroloop.service.lab.sweep import PROCESSES, Progress, Row, Sheets, open_workers, run_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 # ── the grid ──
 
@@ -44,6 +49,7 @@ QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
     "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
 }
 """Kinds for ε, ω and u, by the name of the choice."""
+POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 
 class BurdenError(AeroloopError):
@@ -120,13 +126,14 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         BurdenError: The bits are too few for the quantizer, or the plant has no such sensors.
     """
     wire, plant = settings.wire, settings.plant
-    out, inp = cell.bits_out, cell.bits_in
-    attitude, rate, voltage = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
+    kinds = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
+    signals = {"attitude": cell.bits_out, "rate": cell.bits_out, "voltage": cell.bits_in}
     try:
         chosen = WireSpec(
-            attitude=_quantized(wire.attitude, out, attitude),
-            rate=_quantized(wire.rate, out, rate),
-            voltage=_quantized(wire.voltage, inp, voltage),
+            **{
+                name: _quantized(getattr(wire, name), bits, kind)
+                for (name, bits), kind in zip(signals.items(), kinds, strict=True)
+            },
             actuators=wire.actuators,
             transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
             counter_bits=wire.counter_bits,
@@ -135,8 +142,8 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
     except ValidationError as error:
         why = problem(error, SignalSpec, WireSpec, type(plant))
-        bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
-        raise BurdenError(f"{bits} {cell.quantizer or 'float64'} with sensors {cell.sensors}: {why}") from None
+        name = f"{_bits_text(cell.bits_out, cell.bits_in)} {cell.quantizer or 'float64'}"
+        raise BurdenError(f"{name} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})
 
 
@@ -145,6 +152,10 @@ def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> Signa
     if kind in (None, signal.kind):
         return signal.with_bits(bits)
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
+
+
+def _bits_text(*bits: int | None) -> str:
+    return "/".join("cont" if each is None else str(each) for each in bits)
 
 
 def _pair(text: str) -> _Bits:
@@ -165,45 +176,7 @@ def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list
     return list(dict.fromkeys(names or choices))
 
 
-# ── frames on a classic CAN bus ──
-
-BITRATE: Final = 1_000_000
-"""Bit rate for the load, the highest of classic CAN [bit/s]."""
-
-
-def classic_frame_bits(data_bytes: int) -> int:
-    """Bits of one classic frame of 0…8 data bytes with worst-case stuffing, interframe space included.
-
-    Besides its data, a frame with an 11-bit identifier has 34 bits under stuffing and 13 without. After five equal bits
-    the sender stuffs an opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril
-    and Lukkien, Controller Area Network schedulability analysis, 2007).
-
-    Raises:
-        ValueError: A classic frame does not hold so many bytes.
-    """
-    if not 0 <= data_bytes <= CLASSIC_BYTES:
-        raise ValueError(f"a classic CAN frame holds 0 to {CLASSIC_BYTES} bytes, not {data_bytes}")
-    stuffed = 34 + 8 * data_bytes
-    return stuffed + (stuffed - 1) // 4 + 13
-
-
-def classic_frames(size: int) -> list[int]:
-    """Data bytes of each classic frame that a frame of the loop of `size` ≥ 1 bytes fills.
-
-    A frame of more than eight bytes goes as one CAN FD frame in this project; here it is split without a header.
-    """
-    full, rest = divmod(size, CLASSIC_BYTES)
-    return [CLASSIC_BYTES] * full + [rest] * (rest > 0)
-
-
-def bus_bits(size: int) -> int:
-    """Worst-case bits on a classic bus of a frame of the loop of `size` bytes."""
-    return sum(map(classic_frame_bits, classic_frames(size)))
-
-
 # ── points ──
-
-POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 
 class Traffic(StreamFigures):
@@ -252,17 +225,18 @@ class Point(BaseModel):
     @property
     def bits(self) -> str:
         """Bits out and in, as `--bits` takes them."""
-        return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
-
-    @property
-    def label(self) -> str:
-        """Short label: the bits, or float64."""
-        return self.bits if self.quantizer else "float64"
+        return _bits_text(self.bits_out, self.bits_in)
 
     @property
     def is_baseline(self) -> bool:
         """Whether it is the baseline: float64 at every tick."""
         return self.quantizer is None and self.transmit == "periodic"
+
+    def figure(self, name: str) -> float:
+        """A figure of a point without a `reason`, which has all of them."""
+        value = getattr(self, name)
+        assert isinstance(value, float)
+        return value
 
 
 class Burden(BaseModel):
@@ -323,61 +297,42 @@ def measure_burden(
 def observe(settings: Settings, duration_s: float) -> list[Row]:
     """Run one cell, which sends at every tick, for `duration_s` [s]: fields of its point under each policy."""
     wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
-    frames: list[tuple[bytes, bytes]] = []
     try:
-        found = experiment(settings, duration_s, watch=lambda _k, *both: frames.append(both))
+        figures, course, _ = experiment(settings, duration_s)
     except LoopEndedError as error:
         return [{"transmit": policy, "reason": str(error)} for policy in POLICIES]
-    kinds = wire.measurement, wire.command
-    if found.course is not None:
-        codes = [found.course.measured, found.course.commanded]
-    else:
-        codes = [codes_of(each, kind) for each, kind in zip(zip(*frames, strict=True), kinds, strict=True)]
     rows = []
     for policy in POLICIES:
         measurement, command = (
-            traffic(each, kind, sent_ticks(each, policy, heartbeat), period)
-            for each, kind in zip(codes, kinds, strict=True)
+            traffic(codes, kind, sent_ticks(codes, policy, heartbeat), period)
+            for codes, kind in ((course.measured, wire.measurement), (course.commanded, wire.command))
         )
         both = {
             name: getattr(measurement, name) + getattr(command, name)
             for name in ("bits_per_s", "can_bits_per_s", "can_load")
         }
-        figures = {"z_track": found.figures.z_track, "u_total": found.figures.u_total}
-        rows.append({"transmit": policy, "measurement": measurement, "command": command, **figures, **both})
+        errors = {"z_track": figures.z_track, "u_total": figures.u_total}
+        rows.append({"transmit": policy, "measurement": measurement, "command": command, **errors, **both})
     return rows
-
-
-def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> Floats:
-    """Codes of frames. Shape (frames, components).
-
-    Raises:
-        ValueError: A frame is malformed.
-    """
-    unpacked = [kind.unpack(frame) for frame in frames]
-    if None in unpacked:
-        raise ValueError("a frame is malformed")
-    return np.array([content[1] for content in unpacked if content is not None], float)
 
 
 def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Traffic:
     """The traffic of one direction.
+
+    A frame of more than eight bytes goes as one CAN FD frame in this project; here it is split without a header.
 
     Args:
         codes: Codes at every tick from 0 on. Shape (ticks, components).
         kind: Format of the frames.
         sent: Ticks at which a frame was sent.
         period: Time between ticks [s].
-
-    Raises:
-        ValueError: There are no ticks.
     """
-    if not len(codes):
-        raise ValueError("no ticks, no traffic")
     duration = len(codes) * period
     changes = np.count_nonzero(np.diff(codes, axis=0), axis=0) / duration
     intervals = np.diff(sent) * (period * 1e3)
-    on_bus = len(sent) * bus_bits(kind.size) / duration
+    full, rest = divmod(kind.size, CLASSIC_BYTES)
+    split = [CLASSIC_BYTES] * full + [rest] * (rest > 0)
+    on_bus = len(sent) * sum(map(classic_frame_bits, split)) / duration
     return Traffic(
         frames_per_s=len(sent) / duration,
         bits_per_s=len(sent) * kind.size * 8 / duration,
@@ -385,10 +340,21 @@ def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> 
         component_changes_per_s=changes.tolist(),
         mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
         least_interval_ms=float(intervals.min()) if len(intervals) else None,
-        can_frames=len(classic_frames(kind.size)),
+        can_frames=len(split),
         can_bits_per_s=on_bus,
-        can_load=on_bus / BITRATE,
+        can_load=on_bus / 1e6,
     )
+
+
+def classic_frame_bits(data_bytes: int) -> int:
+    """Bits of one classic CAN frame of 0…8 data bytes with worst-case stuffing, interframe space included.
+
+    Besides its data, a frame with an 11-bit identifier has 34 bits under stuffing and 13 without. After five equal bits
+    the sender stuffs an opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril
+    and Lukkien, Controller Area Network schedulability analysis, 2007).
+    """
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + (stuffed - 1) // 4 + 13
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
@@ -405,25 +371,13 @@ def _compared(points: Sequence[Point], sensors: str) -> list[Point]:
     if not (baseline.z_track and baseline.u_total):
         raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
     done = [point for point in points if point.reason is None]
-    front = pareto_front((_figure(point.bits_per_s), _figure(point.z_track)) for point in done)
-    on_front = {id(point) for point, best in zip(done, front, strict=True) if best}
-    return [
-        point.model_copy(update={"pareto": id(point) in on_front, "against_float64": _ratios(point, baseline)})
-        for point in points
-    ]
-
-
-def _ratios(point: Point, baseline: Point) -> dict[str, float] | None:
-    if point.reason is not None:
-        return None
+    front = pareto_front((point.figure("bits_per_s"), point.figure("z_track")) for point in done)
     names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
-    return {name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names}
-
-
-def _figure(figure: float | None) -> float:
-    """A figure of a point without a `reason`, which has all of them."""
-    assert figure is not None
-    return figure
+    for i, (point, best) in enumerate(zip(done, front, strict=True)):
+        ratios = {name: point.figure(name) / baseline.figure(name) for name in names}
+        done[i] = point.model_copy(update={"pareto": best, "against_float64": ratios})
+    compared = iter(done)
+    return [next(compared) if point.reason is None else point for point in points]
 
 
 # ── as text ──
@@ -443,13 +397,13 @@ def sheets(burden: Burden) -> Sheets:
     for name, text in burden.sensors.items():
         points = burden.under(name)
         yield f"sensors {name}: {text}", [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
-        reasons = [f"{point.bits} {short_name(point)}: {point.reason}." for point in points[::2] if point.reason]
+        reasons = [f"{point.bits} {_short_name(point)}: {point.reason}." for point in points[::2] if point.reason]
         if reasons:
             yield "\n".join(reasons), []
     yield from ((note, []) for note in _notes(burden))
 
 
-def short_name(point: Point) -> str:
+def _short_name(point: Point) -> str:
     """Name of a point's quantizer in a table or a legend."""
     if point.quantizer is None:
         return "float64"
@@ -458,14 +412,14 @@ def short_name(point: Point) -> str:
 
 def _row(always: Point, changed: Point) -> dict[str, str]:
     """A row of a point at every tick, and the same sent on change."""
-    name = {"bits out/in": always.bits, "quantizer": short_name(always)}
+    name = {"bits out/in": always.bits, "quantizer": _short_name(always)}
     ratios, out, inp = always.against_float64, changed.measurement, changed.command
     if ratios is None or out is None or inp is None:
         return name | dict.fromkeys(_COLUMNS, "–")
     error = ratios["z_track"]
     cells = (
-        f"{_figure(always.z_track) * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
-        f"{_figure(always.u_total):.0f}",
+        f"{always.figure('z_track') * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
+        f"{always.figure('u_total'):.0f}",
         f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
         _payload(always),
         _bus(always),
@@ -481,14 +435,14 @@ def _row(always: Point, changed: Point) -> dict[str, str]:
 def _payload(point: Point) -> str:
     assert point.against_float64 is not None
     star = "★ " if point.pareto else ""
-    return f"{star}{_figure(point.bits_per_s) / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
+    return f"{star}{point.figure('bits_per_s') / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
 
 
 def _bus(point: Point) -> str:
     """Bits a second on the bus, and its load; marks a split frame and a load above 1."""
-    load = _figure(point.can_load)
+    load = point.figure("can_load")
     words = _share(load) + (", too much" if load > 1 else "")
-    return f"{_figure(point.can_bits_per_s) / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
+    return f"{point.figure('can_bits_per_s') / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
 
 
 def _is_split(point: Point) -> bool:
@@ -524,3 +478,100 @@ def _notes(burden: Burden) -> Iterator[str]:
             f"{_SPLIT} A frame of more than 8 bytes, reckoned as the classic frames that its bytes fill; in fact it "
             "goes as one CAN FD frame."
         )
+
+
+# ── as a figure ──
+
+
+def draw_burden(burden: Burden, path: Path) -> None:
+    """Draw error against payload bits a second into a file, a panel for each of the sensors, both axes logarithmic.
+
+    Colour and shape mark the quantizer; a full marker is sent on change, a hollow one at every tick. A line joins the
+    Pareto front, its points labelled with bits out/in; dotted lines mark float64 at every tick. Raises OutputError if
+    the file's name is wrong, or it cannot be written.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    from aeroloop.service.report.figure_style import WIDTH_IN, figure_style, save_as
+
+    def key(color: str, marker: str, label: str, face: str | None = None) -> Line2D:
+        face = face or color
+        style = {"marker": marker, "markerfacecolor": face, "linestyle": "none", "markersize": 4, "label": label}
+        return Line2D([], [], color=color, **style)  # type: ignore[arg-type]  # keywords of several types
+
+    names, styles = list(burden.sensors), _styles()
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    with figure_style():
+        size = WIDTH_IN[1 if columns == 1 else 2], 0.75 + 2.5 * rows
+        figure = Figure(figsize=size, layout="constrained")
+        panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
+        for panel, name in zip(panels, names, strict=False):
+            _draw(panel, [point for point in burden.under(name) if point.reason is None])
+            panel.annotate(f"sensors: {name}", (1, 1), xycoords="axes fraction", xytext=(-4, -4),
+                           textcoords="offset points", ha="right", va="top",
+                           bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
+        errors = [_place(point)[1] for point in burden.points if point.reason is None]
+        panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
+        for i, panel in enumerate(panels):
+            panel.set_visible(i < len(names))
+            if i % columns == 0:
+                panel.set_ylabel(r"$z_\mathrm{track}$ [$10^{-4}$ s]")
+            if i + columns >= len(names):  # the last of its column
+                panel.set_xlabel("payload of measurements and commands [kbit/s]")
+                panel.tick_params(labelbottom=True)
+        drawn = {_short_name(point): styles[point.quantizer] for point in burden.points if point.quantizer}
+        legend = [
+            *(key(*style, name) for name, style in drawn.items()),
+            key(*styles[None], "float64"),
+            key("0.4", "o", "sent on change"),
+            key("0.4", "o", "sent at every tick", face="white"),
+            Line2D([], [], color="0.45", linewidth=0.9, label="Pareto front, bits out/in"),
+            Line2D([], [], color="0.3", linewidth=0.6, linestyle=":", label="float64 at every tick"),
+        ]
+        figure.legend(handles=legend, loc="outside lower center", ncols=3)
+        save_as(figure, path)
+
+
+def _styles() -> dict[str | None, tuple[str, str]]:
+    """Colour and marker of each quantizer."""
+    from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE
+
+    return {
+        "uniform": (BLUE, "o"),
+        "hysteresis-uniform": (ORANGE, "s"),
+        "logarithmic-uniform": (GREEN, "^"),
+        "hysteresis-rate": (PURPLE, "p"),
+        None: (BLACK, "D"),
+    }
+
+
+def _place(point: Point) -> tuple[float, float]:
+    """Payload [kbit/s] and error [1e-4 s]."""
+    return point.figure("bits_per_s") / 1e3, point.figure("z_track") * 1e4
+
+
+def _draw(panel: Axes, points: list[Point]) -> None:
+    from aeroloop.service.report.figure_style import logarithmic
+
+    logarithmic(panel.xaxis, (1, 2, 3, 5))
+    logarithmic(panel.yaxis, (1, 2, 3, 5))
+    panel.margins(x=0.08)
+    front = sorted({_place(point): point for point in points if point.pareto}.items())
+    panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)
+    for point in points:
+        (color, marker), (payload, error) = _styles()[point.quantizer], _place(point)
+        face, order = color if point.transmit == "on_change" else "white", 4 if point.pareto else 3
+        panel.plot(
+            payload, error, marker, color=color, markersize=4, markerfacecolor=face, linestyle="none", zorder=order
+        )
+        if point.is_baseline:
+            panel.axvline(payload, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
+            panel.axhline(error, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
+    labelled: list[tuple[float, float]] = []  # to the lower left, where no point is
+    for (x, y), point in front:
+        if all(abs(log10(x / other)) >= 0.2 or abs(log10(y / above)) >= 0.055 for other, above in labelled):
+            labelled.append((x, y))
+            label = point.bits if point.quantizer else "float64"
+            panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=6)

@@ -8,15 +8,19 @@ and sensors, until the attitude error leaves a bound or the plant trips.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import groupby, product
+from math import inf
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
@@ -25,9 +29,24 @@ from aeroloop.service.control.laws.baselines import NonadaptiveSettings, Trackin
 from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
 from aeroloop.service.lab.burden import SENSORS
-from aeroloop.service.lab.law_margins import PUSHED_S, survived
-from aeroloop.service.lab.sweep import Progress, Row, RowFile, Sheets, SweepPlan, rows_file, sweep_rows, write_table
-from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.sweep import (
+    PROCESSES,
+    Progress,
+    Row,
+    Sheets,
+    SweepPlan,
+    open_workers,
+    run_of,
+    sweep_rows,
+    write_table,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# ── what is compared ──
 
 LAWS: Final = ("adaptive", "nonadaptive", *RULES)
 BITS: Final = ("8/6", "cont/cont")
@@ -267,72 +286,49 @@ def run_comparison(
         progress: Called with experiments and searches done, and in all.
 
     Raises:
-        SweepError, OutputError, WorkersError: As of `run_sweep`.
+        SweepError, OutputError: As of `run_sweep`.
     """
-    plan, choices = comparison.plan, comparison.choices
-    pushed = list(_pushed(comparison))
-    before = len(choices) * plan.seeds
-    total = before + len(pushed)
-    searches = [run_of(plan.settings, overrides) for _, overrides in pushed]
-    with RowFile(out and rows_file(out)) as file, open_workers(engine) as workers:
-        rows = sweep_rows(plan, workers, file, lambda done, _: progress(done, total))
-        limits: list[Row] = workers.rows(
-            partial(survived, within_deg=comparison.within_deg), searches, lambda done: progress(before + done, total)
-        )
-    margins = [LawMargin(law=choice.law, plant=choice.plant, **limit)
-               for (choice, _), limit in zip(pushed, limits, strict=True)]  # fmt: skip
+    plan, choices, response, within_deg = comparison
+    searched = dict[tuple[str, str], tuple[str, ...]]()  # calm, with the first of bits and sensors that a plant has
+    for choice, configuration in zip(choices, plan.configurations, strict=True):
+        calm = ("plant.wind.blowing=false",) if choice.wind in WINDS else ()
+        searched.setdefault((choice.law, choice.plant), (*configuration.overrides, *calm))
+    before, work = len(choices) * plan.seeds, partial(survived, within_deg=within_deg)
+    total, searches = before + len(searched), [run_of(plan.settings, overrides) for overrides in searched.values()]
+    with open_workers(engine) as workers:
+        rows = sweep_rows(plan, workers, out, lambda done, _: progress(done, total))
+        margins = workers.rows(work, searches, lambda done: progress(before + done, total))
     if out is not None:
-        write_table(out, plan, rows, _margin_columns(comparison, margins))
-    first = choices[0]
+        of = dict(zip(searched, margins, strict=True))
+        further = (of[choice.law, choice.plant] for choice in choices for _ in range(plan.seeds))
+        texts = {name: LawMargin.model_fields[name].description or "" for name in ("delay_ms", "lost_frames")}
+        texts["within_deg"] = "bound of the attitude error, for the margins [deg]"
+        whole = [row | margin | {"within_deg": within_deg} for row, margin in zip(rows, further, strict=True)]
+        write_table(out, plan, whole, texts)
+    first, gains = choices[0], dict[str, dict[str, Any]]()
+    for choice, configuration in zip(choices, plan.configurations, strict=True):
+        if choice.plant == first.plant:
+            law = with_law_settings(load_over(plan.settings, configuration.overrides)).description()["law"]
+            gains[choice.law] = law
     return Laws(
         duration_s=plan.duration_s,
         seeds=plan.seeds,
-        bandwidth=list(comparison.response.bandwidth),
-        damping_ratio=list(comparison.response.damping),
+        bandwidth=list(response.bandwidth),
+        damping_ratio=list(response.damping),
         period_ms=plan.settings.loop.period * 1e3,
-        within_deg=comparison.within_deg,
+        within_deg=within_deg,
         margin_duration_s=PUSHED_S,
         margin_at=f"{first.bits} bits",
-        gains={choice.law: _gains(plan, configuration) for choice, configuration in
-               zip(choices, plan.configurations, strict=True) if choice.plant == first.plant},
+        gains=gains,
         rows=[_law_row(choice, rows[i * plan.seeds : (i + 1) * plan.seeds]) for i, choice in enumerate(choices)],
-        margins=margins,
+        margins=[
+            LawMargin(law=law, plant=plant, **found) for (law, plant), found in zip(searched, margins, strict=True)
+        ],
         out=None if out is None else str(out),
-    )  # fmt: skip
+    )
 
 
-def _gains(plan: SweepPlan, configuration: Configuration) -> dict[str, Any]:
-    law: dict[str, Any] = with_law_settings(load_over(plan.settings, configuration.overrides)).description()["law"]
-    return law
-
-
-def _pushed(comparison: Comparison) -> Iterator[tuple[Choice, tuple[str, ...]]]:
-    """The combinations whose margins are looked for: calm, with the first of bits and sensors that a plant has."""
-    seen = set[tuple[str, str]]()
-    for choice, configuration in zip(comparison.choices, comparison.plan.configurations, strict=True):
-        if (choice.law, choice.plant) not in seen:
-            seen.add((choice.law, choice.plant))
-            calm = ("plant.wind.blowing=false",) if choice.wind in WINDS else ()
-            yield choice, (*configuration.overrides, *calm)
-
-
-def table_extras(within_deg: float) -> dict[str, float]:
-    """Columns with one value that a table of a comparison has beside those of any sweep."""
-    return {"within_deg": within_deg}
-
-
-def _margin_columns(comparison: Comparison, margins: Sequence[LawMargin]) -> dict[str, tuple[Sequence[Any], str]]:
-    of = {(margin.law, margin.plant): margin for margin in margins}
-    each = [of[choice.law, choice.plant] for choice in comparison.choices for _ in range(comparison.plan.seeds)]
-    columns: dict[str, tuple[Sequence[Any], str]] = {
-        name: ([getattr(margin, name) for margin in each], LawMargin.model_fields[name].description or "")
-        for name in ("delay_ms", "lost_frames")
-    }
-    columns["within_deg"] = [comparison.within_deg] * len(each), "bound of the attitude error, for the margins [deg]"
-    return columns
-
-
-def _law_row(choice: Choice, rows: Sequence[dict[str, Any]]) -> LawRow:
+def _law_row(choice: Choice, rows: Sequence[Row]) -> LawRow:
     """The row of a combination, of those of its seeds."""
     if reasons := [row["reason"] for row in rows if row["reason"] is not None]:
         several = f"{len(reasons)} of {len(rows)} seeds: " if len(rows) > 1 else ""
@@ -343,6 +339,83 @@ def _law_row(choice: Choice, rows: Sequence[dict[str, Any]]) -> LawRow:
     figures |= {name: max(row[name] for row in rows) for name in ("max_error_deg", "second_half_error_deg")}
     sent = fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)
     return LawRow(**choice._asdict(), **figures, bits_per_s=sent)
+
+
+# ── margins of any law on any plant: runs frame by frame, without a watchdog ──
+
+OLDEST_S: Final = 1.0
+"""No search goes beyond this age of a command [s]."""
+PUSHED_S: Final = 10.0
+"""Length of a run with delay or lost frames [s]."""
+
+
+def survived(settings: Settings, within_deg: float) -> Row:
+    """The longest delay [ms], and the most frames lost in a row, with which the error stays within the bound.
+
+    None if none is. It looks no further than a second.
+    """
+    settings = with_law_settings(settings)
+    most, guess = settings.loop.ticks(OLDEST_S), settings.loop.ticks(0.1)
+    delay = last_good(lambda ticks: largest_error_deg(settings, delay=ticks) <= within_deg, guess, most)
+    lost = last_good(lambda ticks: largest_error_deg(settings, lost=ticks) <= within_deg, guess, most)
+    delay_ms = None if delay is None else round(delay * settings.loop.period * 1e3, 6)
+    return {"delay_ms": delay_ms, "lost_frames": lost}
+
+
+def last_good(good: Callable[[int], bool], guess: int, most: int) -> int | None:
+    """The last number that is good, if all larger ones are not, by bisection from a guess.
+
+    None if 0 is not good, `most` if none is found to be bad by doubling the guess up to it.
+    """
+    low, high = 0, max(1, guess)
+    while good(high):
+        low, high = high, 2 * high
+        if high > most:
+            return most
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low if low or good(0) else None
+
+
+def largest_error_deg(settings: Settings, delay: int = 0, lost: int = 0) -> float:
+    """The largest attitude error in the second half of a run [deg]; infinite if the plant trips or the law fails."""
+    try:
+        with closing(Late(settings.plant.make(settings.loop.period), delay, lost)) as plant:
+            found = run_experiment(settings, PUSHED_S, plant=plant).second_half_error_deg
+    except (AeroloopError, ValueError):
+        return inf
+    return inf if found is None else found
+
+
+class Late(Plant):
+    """A plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
+
+    def __init__(self, plant: Plant, delay: int, lost: int) -> None:
+        self.actuators = plant.actuators
+        self._plant, self._every = plant, lost + 1
+        self._due = deque([(0.0,) * plant.actuators] * delay)
+        self._ticks = 0
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Take the command of a tick; the one that is due replaces the one in force."""
+        self._due.append(tuple(voltages))
+        due = self._due.popleft()
+        if self._ticks % self._every == 0:
+            self._plant.actuate(due)
+        self._ticks += 1
+
+    def advance(self) -> None:
+        """Integrate one period."""
+        self._plant.advance()
+
+    def measure(self) -> Measurement:
+        """Sensor values at the end of the last period."""
+        return self._plant.measure()
+
+    def close(self) -> None:
+        """0 V."""
+        self._plant.close()
 
 
 # ── as text ──
@@ -358,18 +431,28 @@ def sheets(laws: Laws) -> Sheets:
             yield "\n".join(failed), []
     for plant, margins in groupby(laws.margins, lambda margin: margin.plant):
         title = f"{plant} · calm · {laws.margin_at} · survived with an error within {laws.within_deg:g}°"
-        yield (
-            title,
-            [
-                {
-                    "law": margin.law,
-                    "delay": "none" if margin.delay_ms is None else f"{margin.delay_ms:g} ms",
-                    "frames lost in a row": "none" if margin.lost_frames is None else str(margin.lost_frames),
-                }
-                for margin in margins
-            ],
-        )
-    yield from ((note, []) for note in _notes(laws))
+        survive = []
+        for each in margins:
+            delay = "none" if each.delay_ms is None else f"{each.delay_ms:g} ms"
+            lost = "none" if each.lost_frames is None else str(each.lost_frames)
+            survive.append({"law": each.law, "delay": delay, "frames lost in a row": lost})
+        yield title, survive
+    bandwidth, damping = (
+        "/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (laws.bandwidth, laws.damping_ratio)
+    )
+    yield (
+        f"Tuned to ωₙ = {bandwidth} rad/s and ζ = {damping} of the linearised error, which the paper's gains have "
+        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured.",
+        [],
+    )
+    yield (
+        f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
+        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
+        "that act later, or of which so many in a row never do, again and again, up to 1 s.",
+        [],
+    )
+    if laws.out is not None:
+        yield f"All experiments: {laws.out}", []
 
 
 def _cells(row: LawRow) -> dict[str, str]:
@@ -387,17 +470,94 @@ def _cells(row: LawRow) -> dict[str, str]:
     return {"law": row.law} | cells
 
 
-def _notes(laws: Laws) -> Iterator[str]:
-    bandwidth, damping = ("/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (
-        laws.bandwidth, laws.damping_ratio))  # fmt: skip
-    yield (
-        f"Tuned to ωₙ = {bandwidth} rad/s and ζ = {damping} of the linearised error, which the paper's gains have "
-        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured."
+# ── as a figure ──
+
+_SHAPES: Final = "osD^vP"
+_PANELS: Final = (
+    (r"$z_\mathrm{track}$ [$10^{-4}$ s]", "z_track", 1e4, True),
+    ("settled error [°]", "second_half_error_deg", 1, True),
+    (r"$u_\mathrm{total}$ [V²·s]", "u_total", 1, False),
+    ("changes of commands [1/s]", "command_changes_per_s", 1, True),
+)
+"""Label, figure, its factor, and whether the axis is logarithmic."""
+
+
+def draw_laws(laws: Laws, path: Path) -> None:
+    """Draw the comparison into a file: a row of panels for each plant and its sensors, a line of marks for each law.
+
+    Colour is calm or wind, a shape the bits. A full bar is the delay that a law survives, a hollow one the frames lost
+    in a row, with their periods. A law without figures has a cross. Raises OutputError if the file's name is wrong, or
+    it cannot be written.
+    """
+    from aeroloop.service.report.figure_style import figure_style, save_as
+
+    with figure_style():
+        save_as(_figure(laws), path)
+
+
+def _figure(laws: Laws) -> Figure:
+    from matplotlib.figure import Figure
+
+    from aeroloop.service.report.figure_style import WIDTH_IN, logarithmic
+
+    rows = sorted(laws.rows, key=lambda row: (row.plant, row.sensors))
+    groups = {place: list(each) for place, each in groupby(rows, lambda row: (row.plant, row.sensors))}
+    kinds, bits = (
+        list(dict.fromkeys(names)) for names in zip(*((row.law, row.bits) for row in laws.rows), strict=True)
     )
-    yield (
-        f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
-        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
-        "that act later, or of which so many in a row never do, again and again, up to 1 s."
-    )
-    if laws.out is not None:
-        yield f"All experiments: {laws.out}"
+    height = 0.7 + len(groups) * (0.75 + 0.17 * len(kinds))
+    figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
+    panels = figure.subplots(len(groups), len(_PANELS) + 1, sharey=True, squeeze=False)
+    for line, ((plant, sensors), found) in zip(panels, groups.items(), strict=True):
+        for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
+            values = [factor * (getattr(row, name) or 0) for row in found]
+            if is_logarithmic and max(values) > 0:
+                logarithmic(panel.xaxis, (1, 2, 5))
+            for row, value in zip(found, values, strict=True):
+                _mark(panel, row, value, kinds.index(row.law), _SHAPES[bits.index(row.bits) % len(_SHAPES)])
+            panel.set_xlabel(label)
+        for margin in laws.margins:
+            if margin.plant == plant:
+                y, lost_ms = kinds.index(margin.law), (margin.lost_frames or 0) * laws.period_ms
+                for offset, length, face in ((-0.14, margin.delay_ms or 0, "0.75"), (0.14, lost_ms, "white")):
+                    line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
+        line[-1].set_xlabel("survived [ms]")
+        line[0].set_yticks(range(len(kinds)), kinds)
+        line[0].set_ylim(len(kinds) - 0.4, -0.6)
+        line[0].set_ylabel(f"{plant}, {sensors}")
+    figure.legend(handles=_legend(laws, bits), loc="outside lower center", ncols=6)
+    return figure
+
+
+def _colours() -> dict[str, str]:
+    from aeroloop.service.report.figure_style import BLUE, ORANGE
+
+    return {"calm": BLUE, "wind": ORANGE}
+
+
+def _mark(panel: Axes, row: LawRow, value: float, line: int, shape: str) -> None:
+    colour = _colours().get(row.wind, "#222222")
+    y = line + 0.13 * (1 if row.wind == "wind" else -1)  # marks of one law that would cover each other
+    if row.reason is not None:
+        panel.plot(0.97, y, "x", color=colour, markersize=4, transform=panel.get_yaxis_transform())
+    else:
+        panel.plot(value, y, shape, color=colour, markersize=4, markerfacecolor="none", markeredgewidth=0.9)
+
+
+def _legend(laws: Laws, bits: list[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    winds = {name: colour for name, colour in _colours().items() if any(row.wind == name for row in laws.rows)}
+    hollow: dict[str, Any] = {"color": "0.4", "markerfacecolor": "none", "linestyle": "none", "markersize": 4}
+    bars = (("0.75", "delay"), ("white", "frames lost in a row"))
+    failed = [Line2D([], [], marker="x", label="did not last", **hollow)]
+    return [
+        *(Line2D([], [], color=colour, linewidth=4, label=name) for name, colour in winds.items()),
+        *(
+            Line2D([], [], marker=_SHAPES[i % len(_SHAPES)], label=f"{pair} bits", **hollow)
+            for i, pair in enumerate(bits)
+        ),
+        *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
+        *(failed if any(row.reason for row in laws.rows) else []),
+    ]

@@ -6,14 +6,16 @@ The same bytes come out for the same figure: files have no date, and SVG ids no 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from aeroloop.service.logs.outputs import OutputError
 
@@ -74,6 +76,14 @@ def stacked(panels: int, height: float = 0.85) -> tuple[Figure, list[Axes]]:
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     return figure, axes
+
+
+def logarithmic(axis: Axis, digits: Sequence[int]) -> None:
+    """A logarithmic axis with plain numbers at these digits of each decade."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_locator(FixedLocator([digit * 10.0**power for power in range(-3, 6) for digit in digits]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def check_path(path: Path) -> Path:
