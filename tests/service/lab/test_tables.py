@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from aeroloop.service.config import Settings, load
-from aeroloop.service.lab import paper
-from aeroloop.service.lab.calibrate import TOLERANCE
-from aeroloop.service.lab.tables import Cell, Tables, baselines, predict, run_cells, sheets
-from aeroloop.service.lab.workers import open_workers, run_of
+from aeroloop.service.lab import tables as paper
+from aeroloop.service.lab.sweep import open_workers, run_of
+from aeroloop.service.lab.tables import TOLERANCE, Cell, Tables, baselines, predict, run_cells, sheets
 from tests.support.in_this_process import workers_here
 
 pytestmark = pytest.mark.processes

@@ -14,19 +14,21 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over, with_law_settings
-from aeroloop.service.lab import law_margins, loop_function, tune, tune_search
+from aeroloop.service.lab import laws, loop_function, tune
 from aeroloop.service.lab.loop_function import Loop
 from aeroloop.service.lab.sweep import Progress
-from aeroloop.service.lab.tune import Tuning, sheets
-from aeroloop.service.lab.tune_search import (
+from aeroloop.service.lab.tune import (
+    MORE,
     Case,
     Limits,
     Ran,
     Search,
     TuneError,
     TuneOptions,
+    Tuning,
     rank,
     run_case,
+    sheets,
     with_case,
 )
 from aeroloop.service.terminal.show import show_all
@@ -48,7 +50,7 @@ def own(name: str, *overrides: str, of: str = HERE) -> Settings:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(law_margins, "PUSHED_S", 0.2)
+    monkeypatch.setattr(laws, "PUSHED_S", 0.2)
 
 
 def optimum(gain: float) -> Ran:
@@ -70,7 +72,7 @@ def modelled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, list[Case]]]:
         return [optimum(gain) for _ in cases]
 
     survives(monkeypatch, {"delay_ms": 70.0, "lost_frames": 7})
-    monkeypatch.setattr(tune_search, "run_cases", runs)
+    monkeypatch.setattr(tune, "run_cases", runs)
     return asked
 
 
@@ -86,7 +88,7 @@ def survives(monkeypatch: pytest.MonkeyPatch, found: dict[str, float | int | Non
         assert within_deg > 0
         return found
 
-    monkeypatch.setattr(tune_search, "survived", survived)
+    monkeypatch.setattr(tune, "survived", survived)
 
 
 NOTHING: dict[str, float | int | None] = {"delay_ms": None, "lost_frames": None}
@@ -123,7 +125,7 @@ def test_a_search_ends_at_the_bounds_of_the_settings_and_at_the_limits_of_its_co
     assert limited.training.changes_per_s is not None
     assert limited.training.changes_per_s <= 250
     assert limited.training.changes_per_s == limited.held_out.changes_per_s
-    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune_search.MORE
+    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * MORE
 
 
 def test_what_trips_or_exceeds_a_limit_ranks_behind_anything_that_does_not() -> None:
@@ -233,7 +235,7 @@ def test_a_run_has_the_same_figures_as_one_function_and_frame_by_frame(
 ) -> None:
     settings = load_over(SLOW, [*overrides, "plant.limits.max_saturated_s=10"])
     compiled = run_case(settings, 2.0)
-    monkeypatch.setattr(Loop, "run", lambda *_: None)
+    monkeypatch.setattr(Loop, "run", lambda *_: None)  # so through frames
     frames = run_case(settings, 2.0)
     assert compiled == frames
     assert compiled.saturated > 0.01
@@ -288,7 +290,7 @@ def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
         gain = first_gain(settings)
         return [optimum(gain if case.seed == 0 else 3.4 - gain) for case in cases]  # 0.5: 2.9
 
-    monkeypatch.setattr(tune_search, "run_cases", runs)
+    monkeypatch.setattr(tune, "run_cases", runs)
     survives(monkeypatch, NOTHING)
     run_here(monkeypatch)
     out = tmp_path / "gains.toml"
@@ -306,7 +308,7 @@ def test_a_limit_that_is_exceeded_in_what_is_held_out_is_named(
         ran = optimum(first_gain(settings))
         return [ran._replace(changes_per_s=(1 + case.seed) * ran.changes_per_s) for case in cases]
 
-    monkeypatch.setattr(tune_search, "run_cases", runs)
+    monkeypatch.setattr(tune, "run_cases", runs)
     survives(monkeypatch, NOTHING)
     result = found(own("Offset"), FEW._replace(max_chatter=500.0))
     assert (result.exceeded, result.worse) == (["changes_per_s"], None)
