@@ -30,7 +30,7 @@ from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Policy, Transmit
 from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
-from aeroloop.service.figures import Floats, Integers, StreamFigures
+from aeroloop.service.figures import Floats, Integers
 from aeroloop.service.lab.experiment import LoopEndedError, experiment, heartbeat_of, sent_ticks
 from aeroloop.service.lab.sweep import PROCESSES, Progress, Row, Sheets, open_workers, run_of
 
@@ -179,68 +179,14 @@ def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list
 # ── points ──
 
 
-class Traffic(StreamFigures):
-    """Traffic of one direction under one policy, over the whole run."""
-
-    frames_per_s: float
-    bits_per_s: float = Field(description="payload bits, padding included")
-    changes_per_s: float = Field(description="changes of a component's code, of all components together")
-    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order")
-    mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
-    least_interval_ms: float | None = Field(description="the least of these times [ms]")
-    can_frames: int = Field(
-        description="classic CAN frames that a frame fills; more than one is a split, without any header, of what "
-        "this project sends as one CAN FD frame"
-    )
-    can_bits_per_s: float = Field(description="bits on a classic CAN bus, with worst-case stuffing")
-    can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
-
-
-class Point(BaseModel):
-    """One cell under one policy. Missing figures are null, with the reason."""
-
-    model_config = ConfigDict(frozen=True)
-
-    bits_out: int | None = Field(description="bits of ε and ω; null is float64")
-    bits_in: int | None = Field(description="bits of u; null is float64")
-    quantizer: str | None = Field(
-        description="the kind of every signal, or hysteresis-rate: hysteresis-uniform for ω, uniform for the others; "
-        "null where nothing is quantized"
-    )
-    sensors: str = Field(description="a name of `Burden.sensors`")
-    transmit: Policy
-    z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")
-    u_total: float | None = Field(default=None, description="∫ uᵀu dt of the commands as sent [V²·s]")
-    measurement: Traffic | None = None
-    command: Traffic | None = None
-    bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
-    can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
-    can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
-    against_float64: dict[str, float] | None = Field(
-        default=None, description="figures over those of float64 at every tick, under the same sensors [1]"
-    )
-    pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
-    reason: str | None = Field(default=None, description="why there are no figures")
-
-    @property
-    def bits(self) -> str:
-        """Bits out and in, as `--bits` takes them."""
-        return _bits_text(self.bits_out, self.bits_in)
-
-    @property
-    def is_baseline(self) -> bool:
-        """Whether it is the baseline: float64 at every tick."""
-        return self.quantizer is None and self.transmit == "periodic"
-
-    def figure(self, name: str) -> float:
-        """A figure of a point without a `reason`, which has all of them."""
-        value = getattr(self, name)
-        assert isinstance(value, float)
-        return value
-
-
 class Burden(BaseModel):
-    """The grid."""
+    """The grid. A point is one cell under one policy.
+
+    A point has its cell (bits of None are float64), transmit, z_track [s], u_total [V²·s], measurement and command as
+    `traffic` has them, of both together bits_per_s (padding included), can_bits_per_s and can_load; against_float64,
+    these figures over those of float64 at every tick under the same sensors; pareto, whether it is on the front of
+    z_track against bits_per_s; and reason, why there are no figures: then all of them are None.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -249,11 +195,11 @@ class Burden(BaseModel):
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
     counter_bits: int = Field(description="bits of the counter in each frame")
     sensors: dict[str, str] = Field(description="meaning of each name")
-    points: list[Point]
+    points: list[Row]
 
-    def under(self, sensors: str) -> list[Point]:
+    def under(self, sensors: str) -> list[Row]:
         """The points with these sensors."""
-        return [point for point in self.points if point.sensors == sensors]
+        return [point for point in self.points if point["sensors"] == sensors]
 
 
 def measure_burden(
@@ -280,7 +226,7 @@ def measure_burden(
     progress(0, len(runs))
     with open_workers(engine) as workers:
         observed = workers.rows(partial(observe, duration_s=duration_s), runs, lambda done: progress(done, len(runs)))
-    points = [Point(**cell._asdict(), **row) for cell, rows in zip(cells, observed, strict=True) for row in rows]
+    points = [cell._asdict() | row for cell, rows in zip(cells, observed, strict=True) for row in rows]
     sensors = dict.fromkeys(cell.sensors for cell in cells)
     return Burden(
         duration_s=duration_s,
@@ -289,37 +235,41 @@ def measure_burden(
         counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in sensors},
         points=[
-            point for name in sensors for point in _compared([point for point in points if point.sensors == name], name)
+            point
+            for name in sensors
+            for point in _compared([point for point in points if point["sensors"] == name], name)
         ],
     )
 
 
+_FIGURES: Final = ("z_track", "u_total", "measurement", "command", "bits_per_s", "can_bits_per_s", "can_load")
+
+
 def observe(settings: Settings, duration_s: float) -> list[Row]:
-    """Run one cell, which sends at every tick, for `duration_s` [s]: fields of its point under each policy."""
+    """Run one cell, which sends at every tick, for `duration_s` [s]: its point under each policy."""
     wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
     try:
         figures, course, _ = experiment(settings, duration_s)
     except LoopEndedError as error:
-        return [{"transmit": policy, "reason": str(error)} for policy in POLICIES]
+        return [{"transmit": policy, **dict.fromkeys(_FIGURES), "reason": str(error)} for policy in POLICIES]
     rows = []
     for policy in POLICIES:
-        measurement, command = (
+        out, inp = (
             traffic(codes, kind, sent_ticks(codes, policy, heartbeat), period)
             for codes, kind in ((course.measured, wire.measurement), (course.commanded, wire.command))
         )
-        both = {
-            name: getattr(measurement, name) + getattr(command, name)
-            for name in ("bits_per_s", "can_bits_per_s", "can_load")
-        }
-        errors = {"z_track": figures.z_track, "u_total": figures.u_total}
-        rows.append({"transmit": policy, "measurement": measurement, "command": command, **errors, **both})
+        both = [out[name] + inp[name] for name in _FIGURES[4:]]
+        values = figures.z_track, figures.u_total, out, inp, *both
+        rows.append({"transmit": policy, **dict(zip(_FIGURES, values, strict=True)), "reason": None})
     return rows
 
 
-def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Traffic:
-    """The traffic of one direction.
+def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Row:
+    """The traffic of one direction under one policy.
 
-    A frame of more than eight bytes goes as one CAN FD frame in this project; here it is split without a header.
+    Changes are those of a code, of all components together and one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order. Intervals
+    are None for less than two frames. On a classic bus of 1 Mbit/s, with worst-case stuffing, can_load above 1 does not
+    fit; can_frames above 1 is a split, without any header, of what this project sends as one CAN FD frame.
 
     Args:
         codes: Codes at every tick from 0 on. Shape (ticks, components).
@@ -333,17 +283,17 @@ def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> 
     full, rest = divmod(kind.size, CLASSIC_BYTES)
     split = [CLASSIC_BYTES] * full + [rest] * (rest > 0)
     on_bus = len(sent) * sum(map(classic_frame_bits, split)) / duration
-    return Traffic(
-        frames_per_s=len(sent) / duration,
-        bits_per_s=len(sent) * kind.size * 8 / duration,
-        changes_per_s=float(changes.sum()),
-        component_changes_per_s=changes.tolist(),
-        mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
-        least_interval_ms=float(intervals.min()) if len(intervals) else None,
-        can_frames=len(split),
-        can_bits_per_s=on_bus,
-        can_load=on_bus / 1e6,
-    )
+    return {
+        "frames_per_s": len(sent) / duration,
+        "bits_per_s": len(sent) * kind.size * 8 / duration,  # payload, padding included
+        "changes_per_s": float(changes.sum()),
+        "component_changes_per_s": changes.tolist(),
+        "mean_interval_ms": float(intervals.mean()) if len(intervals) else None,
+        "least_interval_ms": float(intervals.min()) if len(intervals) else None,
+        "can_frames": len(split),
+        "can_bits_per_s": on_bus,
+        "can_load": on_bus / 1e6,
+    }
 
 
 def classic_frame_bits(data_bytes: int) -> int:
@@ -363,21 +313,32 @@ def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
 
-def _compared(points: Sequence[Point], sensors: str) -> list[Point]:
+def _compared(points: Sequence[Row], sensors: str) -> list[Row]:
     """The points with the same sensors, compared with their baseline and with each other."""
-    baseline = next(point for point in points if point.is_baseline)
-    if baseline.reason is not None:
-        raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
-    if not (baseline.z_track and baseline.u_total):
+    [baseline] = [point for point in points if _is_baseline(point)]
+    if baseline["reason"] is not None:
+        raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline['reason']}")
+    if not (baseline["z_track"] and baseline["u_total"]):
         raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
-    done = [point for point in points if point.reason is None]
-    front = pareto_front((point.figure("bits_per_s"), point.figure("z_track")) for point in done)
+    done = [point for point in points if point["reason"] is None]
+    front = iter(pareto_front((point["bits_per_s"], point["z_track"]) for point in done))
     names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
-    for i, (point, best) in enumerate(zip(done, front, strict=True)):
-        ratios = {name: point.figure(name) / baseline.figure(name) for name in names}
-        done[i] = point.model_copy(update={"pareto": best, "against_float64": ratios})
-    compared = iter(done)
-    return [next(compared) if point.reason is None else point for point in points]
+    compared = []
+    for point in points:
+        has_figures = point["reason"] is None
+        ratios = {name: point[name] / baseline[name] for name in names} if has_figures else None
+        found = {"against_float64": ratios, "pareto": has_figures and next(front), "reason": point["reason"]}
+        compared.append({name: value for name, value in point.items() if name != "reason"} | found)
+    return compared
+
+
+def _is_baseline(point: Row) -> bool:
+    return point["quantizer"] is None and point["transmit"] == "periodic"
+
+
+def bits_of(point: Row) -> str:
+    """Bits out and in, as `--bits` takes them."""
+    return _bits_text(point["bits_out"], point["bits_in"])
 
 
 # ── as text ──
@@ -397,56 +358,55 @@ def sheets(burden: Burden) -> Sheets:
     for name, text in burden.sensors.items():
         points = burden.under(name)
         yield f"sensors {name}: {text}", [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
-        reasons = [f"{point.bits} {_short_name(point)}: {point.reason}." for point in points[::2] if point.reason]
+        reasons = [
+            f"{bits_of(point)} {_short_name(point)}: {point['reason']}." for point in points[::2] if point["reason"]
+        ]
         if reasons:
             yield "\n".join(reasons), []
     yield from ((note, []) for note in _notes(burden))
 
 
-def _short_name(point: Point) -> str:
+def _short_name(point: Row) -> str:
     """Name of a point's quantizer in a table or a legend."""
-    if point.quantizer is None:
-        return "float64"
-    return "hysteresis on ω" if point.quantizer == "hysteresis-rate" else point.quantizer.removesuffix("-uniform")
+    kind: str = point["quantizer"] or "float64"
+    return "hysteresis on ω" if kind == "hysteresis-rate" else kind.removesuffix("-uniform")
 
 
-def _row(always: Point, changed: Point) -> dict[str, str]:
+def _row(always: Row, changed: Row) -> dict[str, str]:
     """A row of a point at every tick, and the same sent on change."""
-    name = {"bits out/in": always.bits, "quantizer": _short_name(always)}
-    ratios, out, inp = always.against_float64, changed.measurement, changed.command
-    if ratios is None or out is None or inp is None:
+    name = {"bits out/in": bits_of(always), "quantizer": _short_name(always)}
+    if always["reason"] is not None:
         return name | dict.fromkeys(_COLUMNS, "–")
-    error = ratios["z_track"]
+    error, out, inp = always["against_float64"]["z_track"], changed["measurement"], changed["command"]
     cells = (
-        f"{always.figure('z_track') * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
-        f"{always.figure('u_total'):.0f}",
-        f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
+        f"{always['z_track'] * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
+        f"{always['u_total']:.0f}",
+        f"{out['changes_per_s']:.0f} + {inp['changes_per_s']:.0f}",
         _payload(always),
         _bus(always),
-        f"{out.frames_per_s:.0f} + {inp.frames_per_s:.0f}",
-        f"{_ms(out.mean_interval_ms)} + {_ms(inp.mean_interval_ms)}",
-        f"{_ms(out.least_interval_ms, 'g')} + {_ms(inp.least_interval_ms, 'g')}",
+        f"{out['frames_per_s']:.0f} + {inp['frames_per_s']:.0f}",
+        f"{_ms(out['mean_interval_ms'])} + {_ms(inp['mean_interval_ms'])}",
+        f"{_ms(out['least_interval_ms'], 'g')} + {_ms(inp['least_interval_ms'], 'g')}",
         _payload(changed),
         _bus(changed),
     )
     return name | dict(zip(_COLUMNS, cells, strict=True))
 
 
-def _payload(point: Point) -> str:
-    assert point.against_float64 is not None
-    star = "★ " if point.pareto else ""
-    return f"{star}{point.figure('bits_per_s') / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
+def _payload(point: Row) -> str:
+    star = "★ " if point["pareto"] else ""
+    return f"{star}{point['bits_per_s'] / 1e3:.1f} ({_share(point['against_float64']['bits_per_s'])})"
 
 
-def _bus(point: Point) -> str:
+def _bus(point: Row) -> str:
     """Bits a second on the bus, and its load; marks a split frame and a load above 1."""
-    load = point.figure("can_load")
+    load = point["can_load"]
     words = _share(load) + (", too much" if load > 1 else "")
-    return f"{point.figure('can_bits_per_s') / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
+    return f"{point['can_bits_per_s'] / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
 
 
-def _is_split(point: Point) -> bool:
-    return any(part is not None and part.can_frames > 1 for part in (point.measurement, point.command))
+def _is_split(point: Row) -> bool:
+    return any(part and part["can_frames"] > 1 for part in (point["measurement"], point["command"]))
 
 
 def _share(ratio: float) -> str:
@@ -508,11 +468,11 @@ def draw_burden(burden: Burden, path: Path) -> None:
         figure = Figure(figsize=size, layout="constrained")
         panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
         for panel, name in zip(panels, names, strict=False):
-            _draw(panel, [point for point in burden.under(name) if point.reason is None])
+            _draw(panel, [point for point in burden.under(name) if point["reason"] is None])
             panel.annotate(f"sensors: {name}", (1, 1), xycoords="axes fraction", xytext=(-4, -4),
                            textcoords="offset points", ha="right", va="top",
                            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
-        errors = [_place(point)[1] for point in burden.points if point.reason is None]
+        errors = [_place(point)[1] for point in burden.points if point["reason"] is None]
         panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
         for i, panel in enumerate(panels):
             panel.set_visible(i < len(names))
@@ -521,7 +481,7 @@ def draw_burden(burden: Burden, path: Path) -> None:
             if i + columns >= len(names):  # the last of its column
                 panel.set_xlabel("payload of measurements and commands [kbit/s]")
                 panel.tick_params(labelbottom=True)
-        drawn = {_short_name(point): styles[point.quantizer] for point in burden.points if point.quantizer}
+        drawn = {_short_name(point): styles[point["quantizer"]] for point in burden.points if point["quantizer"]}
         legend = [
             *(key(*style, name) for name, style in drawn.items()),
             key(*styles[None], "float64"),
@@ -547,31 +507,31 @@ def _styles() -> dict[str | None, tuple[str, str]]:
     }
 
 
-def _place(point: Point) -> tuple[float, float]:
+def _place(point: Row) -> tuple[float, float]:
     """Payload [kbit/s] and error [1e-4 s]."""
-    return point.figure("bits_per_s") / 1e3, point.figure("z_track") * 1e4
+    return point["bits_per_s"] / 1e3, point["z_track"] * 1e4
 
 
-def _draw(panel: Axes, points: list[Point]) -> None:
+def _draw(panel: Axes, points: list[Row]) -> None:
     from aeroloop.service.report.figure_style import logarithmic
 
     logarithmic(panel.xaxis, (1, 2, 3, 5))
     logarithmic(panel.yaxis, (1, 2, 3, 5))
     panel.margins(x=0.08)
-    front = sorted({_place(point): point for point in points if point.pareto}.items())
+    front = sorted({_place(point): point for point in points if point["pareto"]}.items(), key=lambda item: item[0])
     panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)
     for point in points:
-        (color, marker), (payload, error) = _styles()[point.quantizer], _place(point)
-        face, order = color if point.transmit == "on_change" else "white", 4 if point.pareto else 3
+        (color, marker), (payload, error) = _styles()[point["quantizer"]], _place(point)
+        face, order = color if point["transmit"] == "on_change" else "white", 4 if point["pareto"] else 3
         panel.plot(
             payload, error, marker, color=color, markersize=4, markerfacecolor=face, linestyle="none", zorder=order
         )
-        if point.is_baseline:
+        if _is_baseline(point):
             panel.axvline(payload, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
             panel.axhline(error, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
     labelled: list[tuple[float, float]] = []  # to the lower left, where no point is
     for (x, y), point in front:
         if all(abs(log10(x / other)) >= 0.2 or abs(log10(y / above)) >= 0.055 for other, above in labelled):
             labelled.append((x, y))
-            label = point.bits if point.quantizer else "float64"
+            label = bits_of(point) if point["quantizer"] else "float64"
             panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=6)
