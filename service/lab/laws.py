@@ -14,6 +14,7 @@ from contextlib import closing
 from functools import partial
 from itertools import groupby, product
 from math import inf
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -222,38 +223,21 @@ def _response(settings: Settings) -> Response:
 # ── the comparison ──
 
 
-class LawRow(BaseModel):
-    """Figures of a combination, mean over the seeds; errors are the largest of any. Null with a reason."""
-
-    model_config = ConfigDict(frozen=True)
-
-    law: str
-    bits: str = Field(description="of ε and ω, and of u; cont is float64")
-    sensors: str
-    wind: str
-    plant: str
-    z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")
-    u_total: float | None = Field(default=None, description="∫ uᵀu dt of the commands as sent [V²·s]")
-    max_error_deg: float | None = Field(default=None, description="largest attitude error as measured [deg]")
-    second_half_error_deg: float | None = Field(default=None, description="the same in the second half: settled [deg]")
-    command_changes_per_s: float | None = Field(default=None, description="chatter: changes of a voltage [1/s]")
-    bits_per_s: float | None = Field(default=None, description="payload of both directions, sent on change [bit/s]")
-    reason: str | None = Field(default=None, description="why there are no figures, of the first seed that has none")
-
-
-class LawMargin(BaseModel):
-    """What a law survives, calm, with the first of bits and sensors."""
-
-    model_config = ConfigDict(frozen=True)
-
-    law: str
-    plant: str
-    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
-    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
+_MEANS: Final = ("z_track", "u_total", "command_changes_per_s")
+_WORST: Final = ("max_error_deg", "second_half_error_deg")
+_MARGINS: Final = {
+    "delay_ms": "largest further delay of commands within the bound [ms]; null: none is",
+    "lost_frames": "most commands lost in a row, again and again; null: none may be",
+}
 
 
 class Laws(BaseModel):
-    """The comparison."""
+    """The comparison.
+
+    A row has its `Choice`, figures by the names of `Figures` (means over the seeds, and the largest errors of any),
+    bits_per_s of both directions, sent on change, and reason, why there are no figures: then all of them are None. A
+    margin has law, plant, delay_ms and lost_frames: what the law survives, calm, with the first of bits and sensors.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -266,8 +250,8 @@ class Laws(BaseModel):
     margin_duration_s: float = Field(description="length of a run with delay or lost frames [s]")
     margin_at: str = Field(description="bits of these; the sensors are the first of each plant")
     gains: dict[str, dict[str, Any]] = Field(description="settings of each law, for the first plant")
-    rows: list[LawRow]
-    margins: list[LawMargin]
+    rows: list[Row]
+    margins: list[Row]
     out: str | None = Field(description="table of all experiments")
 
 
@@ -298,11 +282,10 @@ def run_comparison(
     with open_workers(engine) as workers:
         rows = sweep_rows(plan, workers, out, lambda done, _: progress(done, total))
         margins = workers.rows(work, searches, lambda done: progress(before + done, total))
+    of = dict(zip(searched, margins, strict=True))
     if out is not None:
-        of = dict(zip(searched, margins, strict=True))
         further = (of[choice.law, choice.plant] for choice in choices for _ in range(plan.seeds))
-        texts = {name: LawMargin.model_fields[name].description or "" for name in ("delay_ms", "lost_frames")}
-        texts["within_deg"] = "bound of the attitude error, for the margins [deg]"
+        texts = {**_MARGINS, "within_deg": "bound of the attitude error, for the margins [deg]"}
         whole = [row | margin | {"within_deg": within_deg} for row, margin in zip(rows, further, strict=True)]
         write_table(out, plan, whole, texts)
     first, gains = choices[0], dict[str, dict[str, Any]]()
@@ -321,24 +304,20 @@ def run_comparison(
         margin_at=f"{first.bits} bits",
         gains=gains,
         rows=[_law_row(choice, rows[i * plan.seeds : (i + 1) * plan.seeds]) for i, choice in enumerate(choices)],
-        margins=[
-            LawMargin(law=law, plant=plant, **found) for (law, plant), found in zip(searched, margins, strict=True)
-        ],
+        margins=[{"law": law, "plant": plant, **of[law, plant]} for law, plant in searched],
         out=None if out is None else str(out),
     )
 
 
-def _law_row(choice: Choice, rows: Sequence[Row]) -> LawRow:
+def _law_row(choice: Choice, rows: Sequence[Row]) -> Row:
     """The row of a combination, of those of its seeds."""
+    figures: Row = choice._asdict() | dict.fromkeys(("z_track", "u_total", *_WORST, _MEANS[-1], "bits_per_s", "reason"))
     if reasons := [row["reason"] for row in rows if row["reason"] is not None]:
         several = f"{len(reasons)} of {len(rows)} seeds: " if len(rows) > 1 else ""
-        return LawRow(**choice._asdict(), reason=f"{several}{reasons[0]}")
-    figures: dict[str, Any] = {
-        name: fmean(row[name] for row in rows) for name in ("z_track", "u_total", "command_changes_per_s")
-    }
-    figures |= {name: max(row[name] for row in rows) for name in ("max_error_deg", "second_half_error_deg")}
-    sent = fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)
-    return LawRow(**choice._asdict(), **figures, bits_per_s=sent)
+        return figures | {"reason": f"{several}{reasons[0]}"}
+    figures |= {name: fmean(row[name] for row in rows) for name in _MEANS}
+    figures |= {name: max(row[name] for row in rows) for name in _WORST}
+    return figures | {"bits_per_s": fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)}
 
 
 # ── margins of any law on any plant: runs frame by frame, without a watchdog ──
@@ -423,19 +402,19 @@ class Late(Plant):
 
 def sheets(laws: Laws) -> Sheets:
     """Figures of each combination, then what each law survives."""
-    for (plant, sensors, wind, bits), found in groupby(laws.rows, lambda r: (r.plant, r.sensors, r.wind, r.bits)):
+    for (plant, sensors, wind, bits), found in groupby(laws.rows, itemgetter("plant", "sensors", "wind", "bits")):
         around = [f"sensors and wind: {wind}"] if sensors == wind else [f"sensors: {sensors}", wind]
         rows = list(found)
         yield " · ".join([plant, *around, f"{bits} bits"]), list(map(_cells, rows))
-        if failed := [f"{row.law}: {row.reason}" for row in rows if row.reason is not None]:
+        if failed := [f"{row['law']}: {row['reason']}" for row in rows if row["reason"] is not None]:
             yield "\n".join(failed), []
-    for plant, margins in groupby(laws.margins, lambda margin: margin.plant):
+    for plant, margins in groupby(laws.margins, itemgetter("plant")):
         title = f"{plant} · calm · {laws.margin_at} · survived with an error within {laws.within_deg:g}°"
         survive = []
         for each in margins:
-            delay = "none" if each.delay_ms is None else f"{each.delay_ms:g} ms"
-            lost = "none" if each.lost_frames is None else str(each.lost_frames)
-            survive.append({"law": each.law, "delay": delay, "frames lost in a row": lost})
+            delay = "none" if each["delay_ms"] is None else f"{each['delay_ms']:g} ms"
+            lost = "none" if each["lost_frames"] is None else str(each["lost_frames"])
+            survive.append({"law": each["law"], "delay": delay, "frames lost in a row": lost})
         yield title, survive
     bandwidth, damping = (
         "/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (laws.bandwidth, laws.damping_ratio)
@@ -455,19 +434,18 @@ def sheets(laws: Laws) -> Sheets:
         yield f"All experiments: {laws.out}", []
 
 
-def _cells(row: LawRow) -> dict[str, str]:
-    figures = {
-        "z_track 10⁻⁴ s": (row.z_track, "{:.1f}", 1e4),
-        "u_total V²·s": (row.u_total, "{:.0f}", 1),
-        "largest": (row.max_error_deg, "{:.1f}°", 1),
-        "settled": (row.second_half_error_deg, "{:.2f}°", 1),
-        "changes/s": (row.command_changes_per_s, "{:.0f}", 1),
-        "kbit/s": (row.bits_per_s, "{:.1f}", 1e-3),
-    }
-    cells = {
-        name: "–" if value is None else form.format(value * scale) for name, (value, form, scale) in figures.items()
-    }
-    return {"law": row.law} | cells
+def _cells(row: Row) -> dict[str, str]:
+    cells = {"law": row["law"]}
+    for title, name, scale, form in (
+        ("z_track 10⁻⁴ s", "z_track", 1e4, "{:.1f}"),
+        ("u_total V²·s", "u_total", 1, "{:.0f}"),
+        ("largest", "max_error_deg", 1, "{:.1f}°"),
+        ("settled", "second_half_error_deg", 1, "{:.2f}°"),
+        ("changes/s", "command_changes_per_s", 1, "{:.0f}"),
+        ("kbit/s", "bits_per_s", 1e-3, "{:.1f}"),
+    ):
+        cells[title] = "–" if row[name] is None else form.format(row[name] * scale)
+    return cells
 
 
 # ── as a figure ──
@@ -500,26 +478,24 @@ def _figure(laws: Laws) -> Figure:
 
     from aeroloop.service.report.figure_style import WIDTH_IN, logarithmic
 
-    rows = sorted(laws.rows, key=lambda row: (row.plant, row.sensors))
-    groups = {place: list(each) for place, each in groupby(rows, lambda row: (row.plant, row.sensors))}
-    kinds, bits = (
-        list(dict.fromkeys(names)) for names in zip(*((row.law, row.bits) for row in laws.rows), strict=True)
-    )
+    place = itemgetter("plant", "sensors")
+    groups = {where: list(each) for where, each in groupby(sorted(laws.rows, key=place), place)}
+    kinds, bits = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits"))
     height = 0.7 + len(groups) * (0.75 + 0.17 * len(kinds))
     figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
     panels = figure.subplots(len(groups), len(_PANELS) + 1, sharey=True, squeeze=False)
     for line, ((plant, sensors), found) in zip(panels, groups.items(), strict=True):
         for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
-            values = [factor * (getattr(row, name) or 0) for row in found]
+            values = [factor * (row[name] or 0) for row in found]
             if is_logarithmic and max(values) > 0:
                 logarithmic(panel.xaxis, (1, 2, 5))
             for row, value in zip(found, values, strict=True):
-                _mark(panel, row, value, kinds.index(row.law), _SHAPES[bits.index(row.bits) % len(_SHAPES)])
+                _mark(panel, row, value, kinds.index(row["law"]), _SHAPES[bits.index(row["bits"]) % len(_SHAPES)])
             panel.set_xlabel(label)
         for margin in laws.margins:
-            if margin.plant == plant:
-                y, lost_ms = kinds.index(margin.law), (margin.lost_frames or 0) * laws.period_ms
-                for offset, length, face in ((-0.14, margin.delay_ms or 0, "0.75"), (0.14, lost_ms, "white")):
+            if margin["plant"] == plant:
+                y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
+                for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
                     line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
         line[-1].set_xlabel("survived [ms]")
         line[0].set_yticks(range(len(kinds)), kinds)
@@ -535,10 +511,10 @@ def _colours() -> dict[str, str]:
     return {"calm": BLUE, "wind": ORANGE}
 
 
-def _mark(panel: Axes, row: LawRow, value: float, line: int, shape: str) -> None:
-    colour = _colours().get(row.wind, "#222222")
-    y = line + 0.13 * (1 if row.wind == "wind" else -1)  # marks of one law that would cover each other
-    if row.reason is not None:
+def _mark(panel: Axes, row: Row, value: float, line: int, shape: str) -> None:
+    colour = _colours().get(row["wind"], "#222222")
+    y = line + 0.13 * (1 if row["wind"] == "wind" else -1)  # marks of one law that would cover each other
+    if row["reason"] is not None:
         panel.plot(0.97, y, "x", color=colour, markersize=4, transform=panel.get_yaxis_transform())
     else:
         panel.plot(value, y, shape, color=colour, markersize=4, markerfacecolor="none", markeredgewidth=0.9)
@@ -548,7 +524,7 @@ def _legend(laws: Laws, bits: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    winds = {name: colour for name, colour in _colours().items() if any(row.wind == name for row in laws.rows)}
+    winds = {name: colour for name, colour in _colours().items() if any(row["wind"] == name for row in laws.rows)}
     hollow: dict[str, Any] = {"color": "0.4", "markerfacecolor": "none", "linestyle": "none", "markersize": 4}
     bars = (("0.75", "delay"), ("white", "frames lost in a row"))
     failed = [Line2D([], [], marker="x", label="did not last", **hollow)]
@@ -559,5 +535,5 @@ def _legend(laws: Laws, bits: list[str]) -> list[Any]:
             for i, pair in enumerate(bits)
         ),
         *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
-        *(failed if any(row.reason for row in laws.rows) else []),
+        *(failed if any(row["reason"] for row in laws.rows) else []),
     ]
