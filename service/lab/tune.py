@@ -25,7 +25,7 @@ from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.figures import Floats
 from aeroloop.service.lab.experiment import LoopEndedError, experiment
 from aeroloop.service.lab.laws import PUSHED_S, survived
-from aeroloop.service.lab.sweep import Progress, Sheets, Workers, run_of, with_seed
+from aeroloop.service.lab.sweep import Progress, Row, Sheets, Workers, run_of, with_seed
 from aeroloop.service.theorem.any_law import certify_any
 from aeroloop.service.theorem.configured import NoTheoremError
 from aeroloop.service.theorem.extremes import BoundlessError
@@ -113,41 +113,31 @@ class Limits(BaseModel):
     changes_per_s: float | None = Field(description="most changes of a commanded voltage [1/s]")
 
 
-class Summary(BaseModel):
-    """Runs with the same gains under several cases. Figures are null where all trip; costs where any does."""
-
-    model_config = ConfigDict(frozen=True)
-
-    cost: float | None = Field(description="mean of z_track + weight · u_total; null where a run trips [s]")
-    z_track: float | None = Field(description="mean [s]")
-    u_total: float | None = Field(description="mean [V²·s]")
-    settled_deg: float | None = Field(description="largest attitude error in the second half, of all runs [deg]")
-    saturated: float | None = Field(description="largest part of the ticks with a voltage at its limit [1]")
-    changes_per_s: float | None = Field(description="most changes of a commanded voltage [1/s]")
-    trips: int = Field(description="runs that ended early")
-    reason: str | None = Field(description="why the first of them did")
-
-    @classmethod
-    def of(cls, rans: Sequence[Ran], weight: float) -> Summary:
-        """Runs with the same gains in sum; the weight is of u_total [1/V²]."""
-        reasons, whole = [ran.reason for ran in rans if ran.reason], [ran for ran in rans if not ran.reason]
-        figures: dict[str, float | None] = dict.fromkeys(("z_track", "u_total", *_WORST, "cost"))
-        if whole:
-            z_track, u_total = (float(np.mean([ran[i] for ran in whole])) for i in (0, 1))
-            figures |= {"z_track": z_track, "u_total": u_total, "cost": None if reasons else z_track + weight * u_total}
-            figures |= {name: max(getattr(ran, name) for ran in whole) for name in _WORST}
-        return cls(**figures, trips=len(reasons), reason=reasons[0] if reasons else None)
-
-    def worse_than(self, before: Summary) -> str | None:
-        """In what it is worse than another set of runs."""
-        if self.trips > before.trips:
-            return f"{self.trips} runs trip, before {before.trips}: {self.reason}"
-        if before.cost is not None and self.cost is not None and self.cost > before.cost:
-            return f"the cost rises from {before.cost:.4g} to {self.cost:.4g}"
-        return None
-
-
 _WORST: Final = ("settled_deg", "saturated", "changes_per_s")
+
+
+def summary(rans: Sequence[Ran], weight: float) -> Row:
+    """Runs with the same gains under several cases, in sum; the weight is of u_total [1/V²].
+
+    cost, z_track and u_total are means, the others the largest of all runs, trips how many ended early and reason why
+    the first of them did. Figures are None where all trip, the cost where any does.
+    """
+    reasons, whole = [ran.reason for ran in rans if ran.reason], [ran for ran in rans if not ran.reason]
+    row: Row = dict.fromkeys(("cost", "z_track", "u_total", *_WORST))
+    if whole:
+        row["z_track"], row["u_total"] = (float(np.mean([ran[i] for ran in whole])) for i in (0, 1))
+        row["cost"] = None if reasons else row["z_track"] + weight * row["u_total"]
+        row |= {name: max(getattr(ran, name) for ran in whole) for name in _WORST}
+    return row | {"trips": len(reasons), "reason": reasons[0] if reasons else None}
+
+
+def _worse(before: Row, after: Row) -> str | None:
+    """In what one set of runs is worse than another."""
+    if after["trips"] > before["trips"]:
+        return f"{after['trips']} runs trip, before {before['trips']}: {after['reason']}"
+    if before["cost"] is not None and after["cost"] is not None and after["cost"] > before["cost"]:
+        return f"the cost rises from {before['cost']:.4g} to {after['cost']:.4g}"
+    return None
 
 
 def rank(rans: Sequence[Ran], limits: Limits, weight: float) -> float:
@@ -220,6 +210,7 @@ class Search:
     Attributes:
         configured: The configured gains.
         training: Cases of each candidate.
+        held_out: Cases that no candidate sees.
         dimensions: What is searched.
         without_effect: Names of what was left out, as it changes no figure.
         found: Runs of every candidate so far, by its gains.
@@ -230,7 +221,7 @@ class Search:
     def __init__(self, settings: Settings, options: TuneOptions, workers: Workers, progress: Progress) -> None:
         self._settings, self._options, self._workers, self._progress = settings, options, workers, progress
         self.configured = _searchable(settings, options.names)
-        self.training, self._held_out = options.cases(settings.plant.emulated)
+        self.training, self.held_out = options.cases(settings.plant.emulated)
         self.dimensions = list(self._dimensions())
         self.without_effect = list[str]()
         self.found = dict[tuple[Gain, ...], list[Ran]]()
@@ -310,26 +301,25 @@ class Search:
             self._progress(self.experiments, self._options.budget)
         return [self.found[key] for key in keys]
 
-    def judged(self, each: Sequence[Gains]) -> list[Tuned]:
+    def judged(self, each: Sequence[Gains]) -> list[Row]:
         """What the search has not seen of some sets of gains: held-out cases, late commands, certificate."""
         options, done, total = self._options, self.experiments, self.experiments + 2 * len(each)
         with_gains = [_with_gains(self._settings, gains) for gains in each]
-        held = partial(run_cases, cases=self._held_out, duration_s=options.duration_s)
+        held = partial(run_cases, cases=self.held_out, duration_s=options.duration_s)
         rans = self._workers.rows(held, list(map(run_of, with_gains)), lambda n: self._progress(done + n, total))
         pushed = [run_of(with_case(one, self.training[0])) for one in with_gains]
         late = partial(survived, within_deg=options.within_deg)
         margins = self._workers.rows(late, pushed, lambda n: self._progress(done + len(each) + n, total))
+        trained = self.evaluate(each)
         return [
-            Tuned(
-                gains=gains,
-                training=Summary.of(trained, options.weight),
-                held_out=Summary.of(ran, options.weight),
-                certificate=_verdict(settings),
-                **margin,
-            )
-            for gains, trained, ran, settings, margin in zip(
-                each, self.evaluate(each), rans, with_gains, margins, strict=True
-            )
+            {
+                "gains": each[i],
+                "training": summary(trained[i], options.weight),
+                "held_out": summary(rans[i], options.weight),
+                **margins[i],
+                "certificate": _verdict(with_gains[i]),
+            }
+            for i in range(len(each))
         ]
 
     def gains(self, factors: Floats) -> Gains:
@@ -412,21 +402,12 @@ def _verdict(settings: Settings) -> str:
 # ── the result ──
 
 
-class Tuned(BaseModel):
-    """A law with some gains."""
-
-    model_config = ConfigDict(frozen=True)
-
-    gains: Gains
-    training: Summary
-    held_out: Summary
-    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
-    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
-    certificate: str = Field(description="verdict of the certificate, or why the law has none")
-
-
 class Tuning(BaseModel):
-    """A search for gains, and what it found."""
+    """A search for gains, and what it found.
+
+    Before and after have gains; training and held_out, as of `summary`; delay_ms and lost_frames, as of `survived`; and
+    certificate, its verdict or why the law has none.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -440,8 +421,8 @@ class Tuning(BaseModel):
     margin_duration_s: float = Field(default=PUSHED_S, description="length of a run with delay or lost frames [s]")
     searched: list[str] = Field(description="gains that were searched, and element where they are several")
     without_effect: list[str] = Field(description="gains that change no figure of the training cases; they stay")
-    before: Tuned
-    after: Tuned
+    before: Row
+    after: Row
     overrides: list[str] = Field(description="what has changed, as `--set` takes it")
     experiments: int = Field(description="run by the search")
     candidates: int
@@ -473,14 +454,13 @@ def tune(
         interrupted = True
     best = search.best()
     before, after = search.judged([search.configured, best])
-    training, held_out = options.cases(settings.plant.emulated)
     return Tuning(
         law=settings.law.kind,
         weight=options.weight,
         limits=search.limits,
         duration_s=options.duration_s,
-        training=training,
-        held_out=held_out,
+        training=search.training,
+        held_out=search.held_out,
         within_deg=options.within_deg,
         searched=[dimension.name for dimension in search.dimensions],
         without_effect=search.without_effect,
@@ -491,11 +471,9 @@ def tune(
         candidates=len(search.found),
         seed=options.seed,
         interrupted=interrupted,
-        worse=after.held_out.worse_than(before.held_out),
+        worse=_worse(before["held_out"], after["held_out"]),
         exceeded=[
-            name
-            for name, limit in search.limits
-            if limit is not None and (getattr(after.held_out, name) or 0.0) > limit
+            name for name, limit in search.limits if limit is not None and (after["held_out"][name] or 0.0) > limit
         ],
     )
 
@@ -503,7 +481,7 @@ def tune(
 def toml_of(tuning: Tuning) -> str:
     """The gains found as a section of a configuration file, after the command's own words on what they are."""
     worse = f"# Not to be used: in the held-out set {tuning.worse}.\n" if tuning.worse else ""
-    gains = tuning.after.model_dump(mode="json")["gains"]
+    gains = {name: gain if isinstance(gain, float) else list(gain) for name, gain in tuning.after["gains"].items()}
     return f"{worse}{toml({'law': {'kind': tuning.law, **gains}})}"
 
 
@@ -513,7 +491,7 @@ def sheets(tuning: Tuning) -> Sheets:
     cost = f"{tuning.experiments} experiments of {tuning.duration_s:g} s with {tuning.candidates} sets of gains"
     yield f"{cost} of law {tuning.law}; seed {tuning.seed}{'; interrupted' if tuning.interrupted else ''}.", []
     yield "", list(_figures(tuning))
-    both = zip(tuning.before.gains.items(), tuning.after.gains.values(), strict=True)
+    both = zip(tuning.before["gains"].items(), tuning.after["gains"].values(), strict=True)
     yield "", [{"gain": name, "before": _numbers(old), "after": _numbers(new)} for (name, old), new in both]
     yield from ((note, []) for note in _notes(tuning))
     if tuning.overrides:
@@ -525,7 +503,7 @@ def _outcome(tuning: Tuning) -> str:
         return "No better gains found."
     if tuning.worse is not None:
         return f"Not to be used: in the held-out set {tuning.worse}."
-    before, after = tuning.before.held_out.cost, tuning.after.held_out.cost
+    before, after = (side["held_out"]["cost"] for side in (tuning.before, tuning.after))
     if not tuning.held_out:
         return "Better gains found, but there is no held-out set: nothing varies with a seed or a wind."
     if before is None or after is None:
@@ -545,12 +523,12 @@ def _figures(tuning: Tuning) -> Iterator[dict[str, str]]:
         ("command changes/s", "changes_per_s", 1, "{:.1f}"),
         ("runs that trip", "trips", 1, "{:.0f}"),
     ):
-        values = [getattr(getattr(side, part), name) for part in ("training", "held_out") for side in both]
+        values = [side[part][name] for part in ("training", "held_out") for side in both]
         cells = ["–" if value is None else form.format(value * scale) for value in values]
         limit = getattr(tuning.limits, name, None)
         yield {"": label} | dict(zip(columns, [*cells, "" if limit is None else form.format(limit)], strict=True))
     for label, name in (("delay survived, ms", "delay_ms"), ("frames lost in a row", "lost_frames")):
-        survives = [getattr(side, name) for side in both]
+        survives = [side[name] for side in both]
         cells = ["none" if value is None else f"{value:g}" for value in survives]
         yield {"": label} | dict(zip(columns, [*cells, "", "", ""], strict=True))
 
@@ -569,7 +547,7 @@ def _notes(tuning: Tuning) -> Iterator[str]:
     )
     if tuning.without_effect:
         yield f"Without effect here, and not changed: {', '.join(tuning.without_effect)}."
-    before, after = tuning.before.certificate, tuning.after.certificate
+    before, after = tuning.before["certificate"], tuning.after["certificate"]
     yield f"Before and after: {before}" if before == after else f"Before: {before}\nAfter: {after}"
 
 

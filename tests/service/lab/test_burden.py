@@ -184,17 +184,6 @@ def test_there_is_a_row_for_each_experiment_and_a_reason_for_each_without_figure
     assert not any(rows for _, rows in notes)
 
 
-def test_the_table_states_what_the_counter_costs(document: tuple[str, Path]) -> None:
-    burden = Burden.model_validate_json(document[0])
-    for bits, line in (
-        (8, "500 + 500 frames/s carry 8 kbit/s of it; 4 bits would carry 4, padding apart."),
-        (10, "500 + 500 frames/s carry 10 kbit/s of it; 4 bits would carry 4, padding apart."),
-        (4, "500 + 500 frames/s carry 4 kbit/s of it, padding apart."),
-    ):
-        notes = [note for note, _ in sheets(burden.model_copy(update={"counter_bits": bits}))]
-        assert f"The counter has {bits} bits: at every tick {line}" in notes
-
-
 # ── traffic ──
 
 KIND = FrameFormat([6, 6], 4)

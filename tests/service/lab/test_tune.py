@@ -105,12 +105,10 @@ MASS = FEW._replace(names=["mass"])
 @pytest.mark.parametrize(("law", "budget"), [("Offset", 120), ("OffsetInPython", 60)])
 def test_a_law_whose_optimum_is_known_comes_near_it_in_expressions_and_in_python(law: str, budget: int) -> None:
     result = found(own(law), FEW._replace(budget=budget, weight=1.0))
-    assert result.after.gains["offset"] == pytest.approx(2, rel=0.02 if budget > 100 else 0.1)
-    assert result.before.gains == {"offset": 0.5}
+    assert result.after["gains"]["offset"] == pytest.approx(2, rel=0.02 if budget > 100 else 0.1)
+    assert result.before["gains"] == {"offset": 0.5}
     assert result.worse is None
-    assert result.after.held_out.cost is not None
-    assert result.before.held_out.cost is not None
-    assert result.after.held_out.cost < 0.02 * result.before.held_out.cost
+    assert result.after["held_out"]["cost"] < 0.02 * result.before["held_out"]["cost"]
     assert result.experiments <= budget
 
 
@@ -118,13 +116,12 @@ def test_a_search_ends_at_the_bounds_of_the_settings_and_at_the_limits_of_its_co
     modelled: list[tuple[float, list[Case]]],
 ) -> None:
     plan = FEW._replace(max_chatter=1e9)
-    assert found(own("Offset"), plan).after.gains["offset"] == pytest.approx(3, rel=1e-2)
+    assert found(own("Offset"), plan).after["gains"]["offset"] == pytest.approx(3, rel=1e-2)
     assert 4 < max(gain for gain, _ in modelled) <= 5  # it went where it trips, never beyond what the law allows
     limited = found(own("Offset"), plan._replace(max_chatter=250.0)).after
-    assert limited.gains["offset"] == pytest.approx(2.5, rel=1e-2)
-    assert limited.training.changes_per_s is not None
-    assert limited.training.changes_per_s <= 250
-    assert limited.training.changes_per_s == limited.held_out.changes_per_s
+    assert limited["gains"]["offset"] == pytest.approx(2.5, rel=1e-2)
+    assert limited["training"]["changes_per_s"] <= 250
+    assert limited["training"]["changes_per_s"] == limited["held_out"]["changes_per_s"]
     assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * MORE
 
 
@@ -153,7 +150,7 @@ def test_the_search_never_sees_what_is_held_out(modelled: list[tuple[float, list
     searched = modelled[: result.candidates]
     assert all(cases == result.training for _, cases in searched)
     after = [(gain, case) for gain, cases in modelled[result.candidates :] for case in cases]
-    sides = [side.gains["offset"] for side in (result.before, result.after)]
+    sides = [side["gains"]["offset"] for side in (result.before, result.after)]
     assert after == [(gain, case) for gain in sides for case in result.held_out]
 
 
@@ -169,7 +166,7 @@ def test_the_same_seed_finds_the_same_in_whatever_order_runs_end(modelled: list[
     plan = FEW._replace(budget=100, max_chatter=1e9)
     first, again = found(SLOW, plan), found(SLOW, plan, count=8)
     assert first == again
-    assert first.after.gains != found(SLOW, plan._replace(seed=1)).after.gains
+    assert first.after["gains"] != found(SLOW, plan._replace(seed=1)).after["gains"]
     assert modelled
 
 
@@ -181,8 +178,8 @@ def test_an_interrupt_ends_the_search_and_keeps_the_best_so_far(modelled: list[t
     result = found(own("Offset"), FEW._replace(max_chatter=1e9), interrupt)
     assert (result.interrupted, result.candidates) == (True, 30)
     best = min((gain for gain, _ in modelled[:30] if gain <= 4), key=lambda gain: abs(gain - 3))
-    assert result.after.gains["offset"] == best
-    assert result.after.held_out.cost == pytest.approx(1e-3 + (best - 3) ** 2)
+    assert result.after["gains"]["offset"] == best
+    assert result.after["held_out"]["cost"] == pytest.approx(1e-3 + (best - 3) ** 2)
 
 
 def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
@@ -201,7 +198,7 @@ def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
     result = found(SLOW, FEW)
     assert result.searched == ["C1[0]"]
     assert len(result.without_effect) == 8
-    assert result.after.gains["C2"] == SLOW.law.model_dump()["C2"]
+    assert result.after["gains"]["C2"] == SLOW.law.model_dump()["C2"]
     assert modelled
 
 
@@ -221,12 +218,6 @@ def test_where_there_is_nothing_to_search_or_nothing_flies_it_is_one_line(
 ) -> None:
     with pytest.raises(TuneError, match=text):
         found(settings, plan._replace(duration_s=2.0))
-
-
-def test_weights_of_a_law_without_gains_are_searched_by_name() -> None:
-    result = found(load_over(SLOW, ["law.kind=lqr"]), FEW._replace(names=["rate_weight"], scale=True, budget=20))
-    assert result.searched == ["rate_weight"]
-    assert result.before.certificate.startswith("no theorem for this law")
 
 
 @pytest.mark.parametrize("overrides", [[], ["wire.transmit=on_change", "wire.voltage.limit=6", "wire.voltage.bits=3"]])
