@@ -52,8 +52,8 @@ QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 
-class BurdenError(AeroloopError):
-    """The grid cannot be run; one line with the reason."""
+class GridError(AeroloopError):
+    """The cells cannot be run or compared; one line with the reason."""
 
 
 class SensorChoice(NamedTuple):
@@ -105,13 +105,13 @@ def grid(
         sensors: Names out of SENSORS.
 
     Raises:
-        BurdenError: An unknown name, or a cell that the configuration does not allow.
+        GridError: An unknown name, or a cell that the configuration does not allow.
     """
     if settings.plant.ideal:
-        raise BurdenError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
-    pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
-    kinds = _chosen("--quantizer", quantizers, QUANTIZERS)
-    levels = _chosen("--sensors", sensors, SENSORS)
+        raise GridError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
+    pairs = [pair for pair in dict.fromkeys(bits_pair(text) for text in bits or BITS) if pair != FLOAT64]
+    kinds = chosen("--quantizer", quantizers, QUANTIZERS)
+    levels = chosen("--sensors", sensors, SENSORS)
     choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
     cells = [BurdenCell(*pair, kind, level) for level in levels for pair, kind in choices]
     for cell in cells:
@@ -123,7 +123,7 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
     """The configuration of a cell, sending at every tick.
 
     Raises:
-        BurdenError: The bits are too few for the quantizer, or the plant has no such sensors.
+        GridError: The bits are too few for the quantizer, or the plant has no such sensors.
     """
     wire, plant = settings.wire, settings.plant
     kinds = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
@@ -142,8 +142,8 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
     except ValidationError as error:
         why = problem(error, SignalSpec, WireSpec, type(plant))
-        name = f"{_bits_text(cell.bits_out, cell.bits_in)} {cell.quantizer or 'float64'}"
-        raise BurdenError(f"{name} with sensors {cell.sensors}: {why}") from None
+        name = f"{bits_text(cell.bits_out, cell.bits_in)} {cell.quantizer or 'float64'}"
+        raise GridError(f"{name} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})
 
 
@@ -154,25 +154,27 @@ def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> Signa
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
 
 
-def _bits_text(*bits: int | None) -> str:
+def bits_text(*bits: int | None) -> str:
+    """Bits out and in as a text, such as 8/6."""
     return "/".join("cont" if each is None else str(each) for each in bits)
 
 
-def _pair(text: str) -> _Bits:
+def bits_pair(text: str) -> _Bits:
+    """Bits out and in of a text such as 8/6, cont or 8/cont. Raises GridError."""
     words = text.split("/") if text != "cont" else [text] * 2
     if len(words) != 2 or not all(
         word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words
     ):
-        raise BurdenError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
+        raise GridError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
     out, inp = (None if word == "cont" else int(word) for word in words)
     return out, inp
 
 
-def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
-    """The names without repetitions, or all choices if there are none."""
+def chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
+    """The names without repetitions, or all choices if there are none. Raises GridError if one is no choice."""
     for name in names:
         if name not in choices:
-            raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
+            raise GridError(f"{option} takes {', '.join(choices)}, not {name!r}")
     return list(dict.fromkeys(names or choices))
 
 
@@ -219,7 +221,7 @@ def measure_burden(
         engine: As of `open_workers`.
 
     Raises:
-        BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
+        GridError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
             configuration.
     """
     runs = [run_of(cell_settings(settings, cell)) for cell in cells]
@@ -317,9 +319,9 @@ def _compared(points: Sequence[Row], sensors: str) -> list[Row]:
     """The points with the same sensors, compared with their baseline and with each other."""
     [baseline] = [point for point in points if _is_baseline(point)]
     if baseline["reason"] is not None:
-        raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline['reason']}")
+        raise GridError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline['reason']}")
     if not (baseline["z_track"] and baseline["u_total"]):
-        raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
+        raise GridError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
     done = [point for point in points if point["reason"] is None]
     front = iter(pareto_front((point["bits_per_s"], point["z_track"]) for point in done))
     names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
@@ -338,7 +340,7 @@ def _is_baseline(point: Row) -> bool:
 
 def bits_of(point: Row) -> str:
     """Bits out and in, as `--bits` takes them."""
-    return _bits_text(point["bits_out"], point["bits_in"])
+    return bits_text(point["bits_out"], point["bits_in"])
 
 
 # ── as text ──
@@ -515,8 +517,8 @@ def _place(point: Row) -> tuple[float, float]:
 def _draw(panel: Axes, points: list[Row]) -> None:
     from aeroloop.service.report.figure_style import logarithmic
 
-    logarithmic(panel.xaxis, (1, 2, 3, 5))
-    logarithmic(panel.yaxis, (1, 2, 3, 5))
+    logarithmic(panel, "x", (1, 2, 3, 5))
+    logarithmic(panel, "y", (1, 2, 3, 5))
     panel.margins(x=0.08)
     front = sorted({_place(point): point for point in points if point["pareto"]}.items(), key=lambda item: item[0])
     panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)

@@ -29,7 +29,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.baselines import NonadaptiveSettings, TrackingSettings
 from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
-from aeroloop.service.lab.burden import SENSORS
+from aeroloop.service.lab.burden import SENSORS, bits_pair, bits_text, chosen
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.sweep import (
     PROCESSES,
@@ -70,10 +70,6 @@ class Choice(NamedTuple):
     plant: str
 
 
-class LawsError(AeroloopError):
-    """The comparison cannot be made; one line with the reason."""
-
-
 class Comparison(NamedTuple):
     """What is to be run."""
 
@@ -111,18 +107,14 @@ def compare(
         within_deg: Bound of the attitude error, for the margins [deg].
 
     Raises:
-        LawsError: An unknown name.
+        GridError: An unknown name.
         ConfigError, PluginError, LawError: A combination is no configuration, or has no such law.
     """
-    for option, given, known in (("--sensors", sensors, [*SENSORS]), ("--wind", winds, [*WINDS])):
-        if unknown := [name for name in given if name not in known]:
-            raise LawsError(f"{option} {unknown[0]!r} is not known: it is one of {', '.join(known)}")
-    if wrong := [pair for pair in bits if pair.count("/") != 1]:
-        raise LawsError(f"--bits takes bits out and in, such as 8/6 or cont/cont, not {wrong[0]!r}")
     found = list[tuple[Choice, Configuration]]()
-    chosen = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
-    axes = chosen, sensors or ("encoders",), winds or WINDS, bits or BITS
-    for plant, sensor, wind, pair in product(*map(dict.fromkeys, axes)):
+    bodies = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
+    levels, airs = chosen("--sensors", sensors or ("encoders",), SENSORS), chosen("--wind", winds, WINDS)
+    pairs = dict.fromkeys(bits_text(*bits_pair(text)) for text in bits or BITS)
+    for plant, sensor, wind, pair in product(dict.fromkeys(bodies), levels, airs, pairs):
         for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
             choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
             if all(choice != other for other, _ in found):
@@ -137,12 +129,12 @@ def compare(
 
 def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]]:
     """A combination as it can be had, and its overrides: a body without joints has no encoders."""
-    out, _, inp = choice.bits.partition("/")
+    out, inp = bits_pair(choice.bits)
     changes: dict[str, Any] = {
         "wire": {
-            "attitude": {"bits": _bits(out)},
-            "rate": {"bits": _bits(out)},
-            "voltage": {"bits": _bits(inp)},
+            "attitude": {"bits": out},
+            "rate": {"bits": out},
+            "voltage": {"bits": inp},
             "transmit": {"measurement": "on_change", "command": "on_change"},
         },
         "plant": {"kind": choice.plant},
@@ -175,10 +167,6 @@ def _motors(settings: Settings, kind: str) -> int:
     plant = load_over(settings, [f"plant.kind={kind}"]).plant.make(settings.loop.period)
     plant.close()
     return plant.actuators
-
-
-def _bits(text: str) -> int | str:
-    return int(text) if text.isdecimal() else text
 
 
 def three_motors(allocation: Sequence[Sequence[float]]) -> list[list[float]]:
@@ -488,7 +476,7 @@ def _figure(laws: Laws) -> Figure:
         for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
             values = [factor * (row[name] or 0) for row in found]
             if is_logarithmic and max(values) > 0:
-                logarithmic(panel.xaxis, (1, 2, 5))
+                logarithmic(panel, "x", (1, 2, 5))
             for row, value in zip(found, values, strict=True):
                 _mark(panel, row, value, kinds.index(row["law"]), _SHAPES[bits.index(row["bits"]) % len(_SHAPES)])
             panel.set_xlabel(label)

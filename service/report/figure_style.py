@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
@@ -78,9 +77,10 @@ def stacked(panels: int, height: float = 0.85) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
-def logarithmic(axis: Axis, digits: Sequence[int]) -> None:
-    """A logarithmic axis with plain numbers at these digits of each decade."""
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+def logarithmic(panel: Axes, which: Literal["x", "y"], digits: Sequence[int]) -> None:
+    """Make an axis of a panel logarithmic, with plain numbers at these digits of each decade."""
+    axis = panel.xaxis if which == "x" else panel.yaxis
+    panel.set(**{f"{which}scale": "log"})
     axis.set_major_locator(FixedLocator([digit * 10.0**power for power in range(-3, 6) for digit in digits]))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())

@@ -24,7 +24,7 @@ from aeroloop.service.lab.burden import (
     QUANTIZERS,
     SENSORS,
     Burden,
-    BurdenError,
+    GridError,
     cell_settings,
     classic_frame_bits,
     draw_burden,
@@ -113,7 +113,7 @@ def test_what_there_is_not_is_refused_in_one_line_before_anything_runs(
 def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
     run_here(monkeypatch)
     still = load(overrides=["reference.kind=hold"])
-    with pytest.raises(BurdenError, match=r"^float64 makes no error, sensors perfect"):
+    with pytest.raises(GridError, match=r"^float64 makes no error, sensors perfect"):
         measure_burden(still, grid(still, ["cont"], sensors=["perfect"]), 0.1)
 
 
