@@ -37,6 +37,7 @@ class Turn(NamedTuple):
     p50: float
     p99: float
     p999: float
+    longest: float
     wake_p999: float
     over_lockstep: float
     memory_mb: float
@@ -58,7 +59,10 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
         with _daemons(Path(folder), words, seconds) as daemons:
             time.sleep(2 + seconds / 2)  # from a controller's start to its session some 2 s pass
             memory = max(memory_mb(process.pid) for process in daemons)
-            daemons[0].wait(seconds + PATIENCE_S)
+            try:
+                daemons[0].wait(seconds + PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                raise SystemExit(f"the controller does not end: {Path(folder, 'controller').read_text()}") from None
             (status,) = json.loads(run("op", "status", "--json", *words)).values()
         review, plant = json.loads(run("log", "review", f"{folder}/log.mcap", "--json")), status["plant"]
     trip, period_us = review["latency_us"], 1e6 / rate_hz
@@ -70,6 +74,7 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
         p50=trip["p50"],
         p99=trip["p99"],
         p999=trip["p999"],
+        longest=trip["max"],
         wake_p999=plant["timing"]["wake"]["p999"],
         over_lockstep=review["z_track"] / z_track,
         memory_mb=memory,
@@ -85,11 +90,11 @@ def _daemons(folder: Path, words: list[str], seconds: float) -> Iterator[list[su
         ["emulator"],
         ["recorder", f"--log={folder}/log.mcap"],
     ]
-    processes = []
+    processes, state = [], os.environ | {"XDG_STATE_HOME": str(folder)}  # a latch of this host is none of theirs
     try:
         for verb in verbs:
             with Path(folder, verb[0]).open("wb") as output:
-                processes.append(subprocess.Popen([*AEROLOOP, *verb, *words], stderr=output))
+                processes.append(subprocess.Popen([*AEROLOOP, *verb, *words], stderr=output, env=state))
         yield processes
     finally:
         for process in processes:
