@@ -202,7 +202,7 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None], options
     _follow_parent(options)
     begun, stop = _stop_on_signals()
     from aeroloop.protocol.runtime.node import Node
-    from aeroloop.protocol.transport.lingering import no_linger
+    from aeroloop.protocol.runtime.realtime import no_linger
     from aeroloop.protocol.transport.zenoh_config import THREADS
     from aeroloop.service.daemon.claim import controller_name
 

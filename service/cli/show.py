@@ -62,7 +62,7 @@ def layout(
     """Print a layout file for Foxglove or Lichtblick that shows a log or `log live`."""
     settings = settings_of(config, overrides, *([f'vehicle="{vehicle}"'] if vehicle is not None else []))
 
-    from aeroloop.service.viewers.layout import layout as describe
+    from aeroloop.service.viewers.schemas import layout as describe
 
     typer.echo(describe(settings.vehicle, settings.wire.motors))
 

@@ -26,8 +26,14 @@ from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.baselines import NonadaptiveSettings, TrackingSettings
-from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
+from aeroloop.service.control.laws.baselines import (
+    TUNED,
+    NonadaptiveSettings,
+    Response,
+    TrackingSettings,
+    response_of,
+    tuned,
+)
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
 from aeroloop.service.lab.burden import SENSORS, bits_pair, bits_text, chosen
 from aeroloop.service.lab.experiment import run_experiment
@@ -49,7 +55,7 @@ if TYPE_CHECKING:
 
 # ── what is compared ──
 
-LAWS: Final = ("adaptive", "nonadaptive", *RULES)
+LAWS: Final = ("adaptive", "nonadaptive", *TUNED)
 BITS: Final = ("8/6", "cont/cont")
 WINDS: Final = {"calm": False, "wind": True}
 PLANTS: Final = ("aero", "rigid_body")

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from aeroloop.protocol.wire.attitude import R, S
 
@@ -35,16 +35,10 @@ Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
 Gains3 = tuple[Gain, Gain, Gain]
 """One for each body axis: x, y, z."""
 
-
-def _positive(values: Vector) -> Vector:
-    if min(values) <= 0:
-        raise ValueError("every element must be positive")
-    return values
-
-
-Diagonal = Annotated[Vector, AfterValidator(_positive)]
+Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 """The diagonal of a positive definite matrix."""
-
+MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
+"""The same of a gain."""
 Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
 
 

@@ -8,8 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from aeroloop.protocol.runtime import node
-from aeroloop.protocol.transport import lingering
+from aeroloop.protocol.runtime import node, realtime
 from aeroloop.protocol.transport.zenoh_config import THREADS
 from aeroloop.service.cli.common import DaemonOptions, run_role
 from aeroloop.service.config import load
@@ -24,7 +23,7 @@ def test_zenoh_gets_several_threads_in_a_daemon_unless_the_user_says_otherwise(m
         return nullcontext(Mock())
 
     monkeypatch.setattr(node, "Node", joins)
-    monkeypatch.setattr(lingering, "no_linger", lambda: None)  # it would filter the tests' own system calls
+    monkeypatch.setattr(realtime, "no_linger", lambda: None)  # it would filter the tests' own system calls
     for configured, used in ((None, THREADS), ("(rx: (worker_threads: 2))", "(rx: (worker_threads: 2))")):
         monkeypatch.delenv("ZENOH_RUNTIME", raising=False)
         if configured is not None:

@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.control.laws.tuning import response_of
+from aeroloop.service.control.laws.baselines import response_of
 from aeroloop.service.lab import laws as module
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.laws import LAWS, Choice, Late, compare, largest_error_deg, last_good, survived

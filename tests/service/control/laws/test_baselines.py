@@ -16,15 +16,13 @@ from scipy.linalg import solve_discrete_are
 
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.control.laws.baselines import nearer, optimal_gains, riccati
+from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gains, response_of, riccati, tuned
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.registry import OwnLawSettings, law_of, own_settings
-from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 
-TUNED = [*RULES]
 BASELINES = [*TUNED, "nonadaptive"]
 PERIOD = 0.002
 

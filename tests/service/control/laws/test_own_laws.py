@@ -118,12 +118,6 @@ def _codes(own: Settings, frame: bytes) -> Sequence[float]:
     return tuple(read[1])
 
 
-def test_an_experiment_with_python_goes_through_frames_and_has_the_same_figures() -> None:
-    found = experiment(configured(PYTHON), 1.0)
-    assert not found.compiled
-    assert found.figures == experiment(configured(EXPRESSIONS), 1.0).figures
-
-
 # Laws that fail
 
 WHY = {
