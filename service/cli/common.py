@@ -162,10 +162,10 @@ def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
 
 def check_engine(engine: str) -> None:
     """Exit with 2 unless an engine can be used."""
-    from aeroloop.service.lab import workers
+    from aeroloop.service.lab import sweep
 
     with checked():
-        workers.check_engine(engine)
+        sweep.check_engine(engine)
 
 
 def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:

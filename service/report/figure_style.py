@@ -6,12 +6,15 @@ The same bytes come out for the same figure: files have no date, and SVG ids no 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from aeroloop.service.logs.outputs import OutputError
 
@@ -31,6 +34,15 @@ BLUE, ORANGE, GREEN, PURPLE, BLACK = "#0072b2", "#d55e00", "#009e73", "#b0568c",
 def figure_style() -> AbstractContextManager[None]:
     """Every figure that is drawn and saved within has the style."""
     return style.context(Path(__file__).with_name("paper.mplstyle"))
+
+
+def logarithmic(panel: Axes, which: Literal["x", "y"], digits: Sequence[int]) -> None:
+    """Make an axis of a panel logarithmic, with plain numbers at these digits of each decade."""
+    axis = panel.xaxis if which == "x" else panel.yaxis
+    panel.set(**{f"{which}scale": "log"})
+    axis.set_major_locator(FixedLocator([digit * 10.0**power for power in range(-3, 6) for digit in digits]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def check_path(path: Path) -> Path:

@@ -80,7 +80,6 @@ def test_our_aero_as_an_fmu_moves_as_our_emulated_one_along_the_papers_experimen
     1e-12 leaves room for another compiler's library of sines; without closed loop, nothing grows faster than the time.
     """
     course = experiment(with_bits(load(overrides=["plant.ideal=true"]), "8", "6"), 50.0).course
-    assert course is not None
     voltages = [(float(u2), float(u3)) for u2, u3 in course.voltages]
     ours = flat(driven(IDEAL.build(PERIOD), voltages))
     assert np.ptp(ours[:, 3]) > 0.1  # it does move: this is sin(ψ/2) cos(θ/2)

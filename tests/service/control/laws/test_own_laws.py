@@ -109,7 +109,7 @@ def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_f
     found = experiment(own, 3.0)
     commands: list[bytes] = []
     assert found.figures == run_experiment(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
-    assert found.course is not None
+    assert found.compiled
     assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
     assert np.abs(found.course.voltages).max() > 1
 
