@@ -95,7 +95,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
     at = {k: i for i, k in enumerate(ticks.k.tolist())}
     published = 0
-    for found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
+    for _, found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
         telemetry = Telemetry.model_validate_json(found.data)
         i = at[telemetry.tick]
         assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
