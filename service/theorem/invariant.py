@@ -130,7 +130,7 @@ class Reach:
 
 def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
-    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * p.delta_omega
+    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * (p.delta_omega + p.encoder.ripple)
     return Reach(axis_rate=p.axis_rate, half_angle=p.half_angle_d, noise=torque, deviation=torque)
 
 
