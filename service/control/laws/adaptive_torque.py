@@ -13,10 +13,10 @@ The body is (C.2) with three columns a body axis in place of one, and all of θ 
 
     Φ(ω) = [−diag ω, −diag tanh(ω/ε), I],    θ = (θ_v, θ_c, θ_d),    θ_v ≥ 0, θ_c ≥ 0
 
-The law is (C.22) with a gain k₁ of the attitude error, and with Φ at ω_r, but at ω for the damping as first estimated,
-which every law here feeds forward:
+The law is (C.22) with a gain k₁ of the attitude error, and with Φ at ω_r. Every law here feeds the damping as first
+estimated forward at ω = ω_r + z₂, hence the θ̂_v(t₀) beside C₂:
 
-    B u = −k₁(±ε̃) − C₂z₂ − Φ(ω_r)(θ̂ − θ̂(t₀)) − Φ(ω)θ̂(t₀) − Ψ − J(S(ω)Rω_d − Rω̇_d − α̇)
+    B u = −k₁(±ε̃) − (C₂ − diag θ̂_v(t₀))z₂ − Φ(ω_r)θ̂ − Ψ − J(S(ω)Rω_d − Rω̇_d − α̇)
     θ̂' = Proj{Γ Φ(ω_r)ᵀ z₂}
 
 For equal k₁ and with θ̃ = θ − θ̂, the paper's Lyapunov function plus one term a column,
@@ -26,9 +26,8 @@ For equal k₁ and with θ̃ = θ − θ̂, the paper's Lyapunov function plus o
 
 whose third term is never positive, because tanh rises and ω − ω_r = z₂. README.md derives it.
 
-θ_c's first estimate is part of Φ(ω_r)θ̂ from the start. Proj keeps each element of θ̂ within a bound of its first value,
-and friction from being negative. While a motor saturates friction is not learned, and θ̂_d gives way to what the motors
-lack, as the PID's integral does (back-calculation: K. J. Åström and T. Hägglund, PID Controllers, 1995).
+Proj keeps each element of θ̂ within a bound of its first value, and friction from being negative. While a motor
+saturates friction is not learned, and θ̂_d gives way to what the motors lack, as the PID's integral does.
 """
 
 from __future__ import annotations
