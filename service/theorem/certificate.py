@@ -327,6 +327,7 @@ def beyond(settings: Settings, desired: Extremes, p: Premises, at: Reach) -> lis
         ("|ω_k|", rate, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
         ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
         ("|u_k|", largest_voltage(settings, desired, at), "V", limit, "saturation: wire.voltage.limit"),
+        ("|θ̂_d|", at.integral, "N·m", p.law.torque, "law.torque_bound"),
     )
     return [each for each in ranges if each[1] > each[3]]
 

@@ -7,7 +7,9 @@ reference,
 
 - the paper's law (C.22): z₂ = ω_e + C₁ε̃ and ᾱ = −½ C₁ (η̃ I + S(ε̃)) ω_e make k_p = I + C₁C₂, k_d = C₂, α = ½ J C₁;
 - without adaptation θ̂ stays at its first value, the centre of the ball that holds θ;
-- PD and PID: their own gains, α = 0.
+- PD and PID: their own gains, α = 0;
+- `adaptive-torque`: k_p = k₁ + C₁C₂, k_i = Γ_d, and the rest as the paper's law; what it makes of Coulomb friction
+  counts as a disturbance.
 
 c of a law without an integral is C₁, or 0: the share of ε̃ in z₂.
 """
@@ -15,12 +17,13 @@ c of a law without an integral is C₁, or 0: the share of ε̃ in z₂.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import hypot, inf
+from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.laws.adaptive import ESTIMATE_REACH, AdaptiveSettings
+from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
 from aeroloop.service.control.laws.baselines import NonadaptiveSettings, PDSettings, PIDSettings
 from aeroloop.service.control.laws.interface import LawSettings
 
@@ -45,6 +48,9 @@ class Feedback(NamedTuple):
         reach: Largest ‖θ̂ − θ̂(t₀)‖: k_θ/0.95 by the projection, 0 where nothing adapts [N·m·s/rad].
         Gamma: Adaptation gain; 0 where nothing adapts.
         volts: |u| from which the law itself saturates [V].
+        torque: |θ̂_d| from which the estimate of a constant torque is kept back [N·m].
+        coulomb: Largest ‖θ̂_c‖, an estimate of Coulomb friction, which counts as a disturbance [N·m].
+        virtual: Whether θ̂ − θ̂(t₀) acts at the virtual rate ω − z₂ in place of ω.
     """
 
     kp: Vector
@@ -57,6 +63,9 @@ class Feedback(NamedTuple):
     reach: float
     Gamma: Vector
     volts: float = inf
+    torque: float = inf
+    coulomb: float = 0.0
+    virtual: bool = False
 
     @property
     def theta_error(self) -> float:
@@ -100,6 +109,27 @@ def feedback_of(law: LawSettings) -> Feedback:
                 reach=0.0,
                 Gamma=_NONE,
                 volts=pid.voltage_limit if pid else inf,
+            )
+        case AdaptiveTorqueSettings():
+            return Feedback(
+                kp=_each(lambda k, c: k + c, law.k1, _each(lambda c1, c2: c1 * c2, law.C1, law.C2)),
+                kd=law.C2,
+                alpha=_each(lambda j, c1: j * c1 / 2, law.inertia, law.C1),
+                ki=law.Gamma_torque,
+                share=law.C1,
+                centre=law.damping_estimate,
+                radius=law.damping_bound,
+                reach=sqrt(3) * law.damping_bound if any(law.Gamma_damping) else 0.0,  # a box, not a ball
+                Gamma=law.Gamma_damping,
+                volts=law.voltage_limit,
+                torque=min(law.torque_bound),
+                coulomb=hypot(
+                    *(
+                        first + law.coulomb_bound * (gain > 0)
+                        for first, gain in zip(law.coulomb_estimate, law.Gamma_coulomb, strict=True)
+                    )
+                ),
+                virtual=True,
             )
     raise NoTheoremError(f"no theorem for this law, {law.kind}")
 

@@ -113,6 +113,7 @@ class Reach:
         noise: Largest torque by which the command errs, by quantization and sensors [N·m].
         hold: The part of it that comes from the age of the command [N·m].
         deviation: Largest torque of the command beyond that of the reference [N·m].
+        integral: Largest torque of the integral, or estimate of a constant torque [N·m].
     """
 
     D: tuple[float, ...] = (0.0,) * 7
@@ -126,6 +127,7 @@ class Reach:
     noise: float = 0.0
     hold: float = 0.0
     deviation: float = 0.0
+    integral: float = 0.0
 
 
 def without_error(p: Premises) -> Reach:
@@ -226,10 +228,9 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     delta_q = p.delta_q(asin(eps_e))
     delta_R = 2 * delta_q
     delta_omega = p.delta_omega + p.encoder.turn * omega
-    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (
-        p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega
-    )
-    filtered = p.encoder.lag * omega_e_dot  # what the linear equations have of the filter only for k_d, c and θ̂(t₀)
+    delta_omega += p.encoder.angle * axis_omega
+    delta_omega += p.encoder.lag * (p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega)
+    filtered = p.encoder.lag * omega_e_dot  # the linear equations have the filter for k_d, c and θ̂(t₀) only
     delta_omega_e = delta_omega + delta_R * p.k_omega_d
     if len(set(law.kp)) == len(set(law.kd)) == 1:  # parts of one error at right angles to each other
         of_state = delta_q * hypot(kp, kp * eps_e + 2 * kd * p.k_omega_d)
@@ -250,7 +251,8 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     # A command is old: its feedback by the age, the rest of it by the rotors' lag, too.
     errs = delta_omega + filtered + p.encoder.ripple
     theta_dot = max(law.Gamma) * (axis_omega + errs) * (z2 + errs + delta_R * p.k_omega_d + share * delta_q)
-    theta_dot *= sqrt(max(law.Gamma) / min(law.Gamma)) if theta_dot else 1.0  # the projection's norm
+    if theta_dot and not law.virtual:  # the norm of the ball's projection
+        theta_dot *= sqrt(max(law.Gamma) / min(law.Gamma))
     rest_dot = (
         (law.reach if late else law.estimate) * omega_dot + theta_dot * axis_omega
         + hypot(*law.centre) * (p.k_omega_d_dot + omega_e * p.k_omega_d) * late
@@ -261,11 +263,15 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     )  # fmt: skip
     hold = p.age * at["feedback_dot"] + (p.age + p.lag) * rest_dot
     steady = kd + alpha + hypot(*law.centre)  # gain of the rate that stays, so that encoders' ripple passes as an angle
-    fast = law.theta_error * turned + p.k_tau_d
+    fast = law.theta_error * turned + p.k_tau_d + law.coulomb
+    if law.virtual:  # −diag(ω_e)(θ − θ̂(t₀)) − c diag(ε̃)(θ̂ − θ̂(t₀)) of θ̃, and the errors and the rate of ω − z₂
+        fast += law.reach * share * eps_e
+        noise += law.reach * (delta_R * p.k_omega_d + share * delta_q)
+        hold += (p.age + p.lag) * law.reach * share * omega_e / 2
 
     # What drives the linear equations.
     push_dot = law.theta_error * p.k_omega_d_dot + p.axis_rate * theta_dot
-    d2 = fast + law.theta_error * omega_e  # θ̃ acts on ω_e
+    d2 = fast + (law.radius if law.virtual else law.theta_error) * omega_e  # θ̃ acts on ω_e
     if p.tilt is not None:
         fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
     d4 = delta_omega_e + share * delta_q + p.period * (omega_e_dot + share * at["eps_dot"])
@@ -273,9 +279,9 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     gap += 2 * steady * p.encoder.angle / p.lag if p.lag else 0.0
     d5 = noise + ki * p.encoder.angle + hold + p.uneven * gap
     deviation = (
-        at["feedback"] + slow + noise + steady * p.encoder.ripple + law.estimate * axis_omega + p.weight * 2 * eps_e
-        + j * (omega_e * p.k_omega_d + 2 * eps_e * p.k_omega_d_dot) + alpha * zeta * omega_e
-        + spread * omega**2
+        at["feedback"] + slow + noise + law.coulomb + steady * p.encoder.ripple + law.estimate * axis_omega
+        + p.weight * 2 * eps_e + spread * omega**2 + alpha * zeta * omega_e
+        + j * (omega_e * p.k_omega_d + 2 * eps_e * p.k_omega_d_dot)
     )  # fmt: skip
     size = linear.z * slow + at["z"]
     return Reach(
@@ -290,6 +296,7 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         noise=noise,
         hold=hold,
         deviation=deviation,
+        integral=ki * at["integral"] + slow,
     )
 
 

@@ -28,6 +28,7 @@ UNEQUAL = {
     "nonadaptive": ("law.C1=[0.3, 0.25, 0.35]", "law.C2=[0.15, 0.2, 0.17]"),
     "pd": ("law.kp=[1.0, 0.9, 1.2]", "law.kd=[0.15, 0.2, 0.17]"),
     "pid": ("law.kp=[1.2, 1.1, 1.3]", "law.kd=[0.2, 0.2, 0.18]"),
+    "adaptive-torque": ("law.k1=[0.5, 0.4, 0.6]", "law.C2=[0.15, 0.2, 0.17]"),
 }
 
 
@@ -89,10 +90,11 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     The received state errs within the quantizers' bounds, θ and θ̂ are within their balls.
     """
     changes = [f"law.kind={kind}", "law.inertia=[0.02, 0.022, 0.024]" if unequal else "law.gravity=9.81"]
-    changes += ["law.voltage_limit=1e6"] if kind == "pid" else []  # within the set nothing saturates
+    changes += ["law.voltage_limit=1e6"] if kind in ("pid", "adaptive-torque") else []  # within the set none saturates
+    changes += ["law.damping_bound=0.002", "law.coulomb_bound=0.0005"] if kind == "adaptive-torque" else []
     settings = settings_of(bits, *changes, *(UNEQUAL[kind] if unequal else ()))
     p, law, rng, n = of(settings), settings.law, np.random.default_rng(bits), 20_000
-    at = reach(p, 0.02)
+    at = reach(p, 0.005)
     assert at is not None
     J, B, period = np.array(law.inertia), np.array(law.allocation), settings.loop.period
     desired = Angles(*(part[0] for part in Plan.of(settings.reference).at(rng.uniform(0, 40, n)[None])))
@@ -100,6 +102,8 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     q_d = with_scalar(vectors(desired))
     theta = np.array(p.law.centre) + balls(rng, p.law.radius, n)
     theta_hat = np.array(p.law.centre) + balls(rng, p.law.reach, n)
+    if kind == "adaptive-torque":
+        theta_hat = np.maximum(0.0, np.array(p.law.centre) + p.law.radius * rng.uniform(-1, 1, (n, 3)))
     eps_e, omega_e = balls(rng, at.eps_e, n), balls(rng, at.omega_e, n)
     q = product(q_d, with_scalar(eps_e))
     R_d, R_b = rotation(q_d), np.swapaxes(rotation(q), 1, 2)
@@ -110,17 +114,20 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     off[2][:, 0] = 0.0  # u₁ is fictitious
     eps_Q = q[:, 1:] + off[0]
     q_Q = np.where(q[:, :1] < 0, [-1.0, 1, 1, 1], 1.0) * with_scalar(eps_Q)
-    integral = 0.1 * rng.standard_normal((n, 3))
+    integral = 0.01 * rng.standard_normal((n, 3))
+    estimates = {"torque_estimate": integral * p.law.ki, "damping_estimate": theta_hat,
+                 "coulomb_estimate": 0.0005 * rng.random((n, 3)) ** 0.1}  # fmt: skip
     states = {
         "adaptive": {"damping_estimate": theta_hat, "sign": np.ones((n, 1))},
         "pid": {"sign": np.ones((n, 1)), "integral": integral},
+        "adaptive-torque": {"sign": np.ones((n, 1)), **estimates},
     }
     given = {"attitude": q_Q, "rate": omega + off[1], "desired_attitude": q_d, "desired_rate": omega_d,
              "desired_acceleration": omega_d_dot}  # fmt: skip
     u, after = commanded(settings, given, states.get(kind, {"sign": np.ones((n, 1))}))
-    if kind != "adaptive":
+    if kind not in ("adaptive", "adaptive-torque"):
         theta_hat = np.broadcast_to(p.law.centre, (n, 3))
-    theta_hat_dot = (after["damping_estimate"] - theta_hat) / period if kind == "adaptive" else 0 * theta
+    theta_hat_dot = (after.get("damping_estimate", theta_hat) - theta_hat) / period
     weight = np.array([0.0, 0.0, -law.mass * law.gravity])
     Psi = np.cross(np.array(law.centre_of_mass), times(R_b, weight)) - np.cross(omega, J * omega)
     torque = Psi - omega * theta + (u + off[2]) @ B.T  # J ω̇ of (C.2)
@@ -133,8 +140,9 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     d3 = -b_dot * (theta - theta_hat) + b * theta_hat_dot
     found = [np.linalg.norm(d, axis=1).max() for d in (d1, d2, d3)]
     allowed = [at.D[0], at.D[1] + at.D[4], at.D[2]]
-    if kind == "pid":
-        d4 = (after["integral"] - integral) / period - omega_e - np.array(p.law.share) * eps_e
+    if any(p.law.ki):
+        later = after["integral"] if kind == "pid" else after["torque_estimate"] / p.law.ki
+        d4 = (later - integral) / period - omega_e - np.array(p.law.share) * eps_e
         found.append(np.linalg.norm(d4, axis=1).max())
         allowed.append(at.D[3])
     assert np.all(np.array(found) <= allowed)
