@@ -91,38 +91,30 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, Any]:
-    elsewhere = tuple(_variable(f"{section}.") for section in unread)
-    given = {
-        name: text
-        for name, text in os.environ.items()
-        if name.upper().startswith(ENV_PREFIX) and not name.upper().startswith(elsewhere)
-    }
-    known = {_variable(key): key for key in keys(model)} if given else {}
+    given = {name: text for name, text in os.environ.items() if name.upper().startswith(ENV_PREFIX)}
+    known = {key.upper(): key for key in keys(model)} if given else {}
     tree: dict[str, Any] = {}
     for name, text in sorted(given.items()):
-        variable = name.upper()
-        section = next((free for free in _FREE if variable.startswith(_variable(f"{free}."))), None)
-        if section is not None:
-            option = variable.removeprefix(_variable(f"{section}.")).lower().replace("__", ".")
-            _put(tree, f"{section}.{option}", _value(text))
-        elif variable in known:
-            _put(tree, known[variable], _value(text))
-        elif variable.startswith(_variable("law.")):  # of a user's law: in lower case, or as written if in mixed case
-            own = name[len(_variable("law.")) :]
-            _put(tree, f"law.{own.lower() if own.isupper() else own}", _value(text))
+        key = name[len(ENV_PREFIX) :].replace("__", ".")
+        free = next((each for each in _FREE if key.lower().startswith(each)), None)
+        if key.lower().partition(".")[0] in unread:
+            continue
+        if key.upper() in known:
+            key = known[key.upper()]
+        elif free is not None:  # in lower case, or as written if in mixed case
+            own = key[len(free) :]
+            key = free + (own.lower() if own.isupper() else own)
         else:
-            found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
-            hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
+            found = closest(key, known.values())
+            variable = ENV_PREFIX + (found or "").upper().replace(".", "__")
+            hint = f"did you mean {variable}?" if found else "unset it, or see `aeroloop show config`"
             raise ConfigError(f"{name} in the environment is no setting: {hint}")
+        _put(tree, key, _value(text))
     return tree
 
 
-def _variable(key: str) -> str:
-    return ENV_PREFIX + key.upper().replace(".", "__")
-
-
-_FREE: Final = ("can.options", "plant.own")
-"""Sections in which any key may be given: its name in lower case."""
+_FREE: Final = ("can.options.", "plant.own.", "law.")
+"""Sections in which any key may be given: a user's, or another library's."""
 
 
 def _put(tree: dict[str, Any], key: str, value: Any) -> None:

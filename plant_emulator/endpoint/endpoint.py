@@ -13,7 +13,7 @@ from math import acos, cos, degrees, hypot, isfinite, radians
 
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.endpoint.vehicle_claim import Trip, VehicleClaim
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
@@ -164,25 +164,25 @@ class LimitMonitor:
         """Reset the counts for a new session."""
         self._saturated = self._invalid = 0
 
-    def check(self, seen: Measurement, voltages: Sequence[float]) -> Trip | None:
-        """Return a reason to trip, or None, for this tick's measurement and commanded voltages [V] (actuators,)."""
+    def check(self, seen: Measurement, voltages: Sequence[float]) -> tuple[TripCause, str] | None:
+        """Cause and reason to trip at a measurement and commanded voltages [V], (actuators,); None for neither."""
         limits = self._settings
         (w, x, y, z), (wx, wy, wz) = seen
         if not isfinite(w + x + y + z + wx + wy + wz):
             self._invalid += 1
             if (invalid_s := self._invalid * self._period_ns * 1e-9) > limits.max_invalid_s:
-                return Trip(TripCause.SENSORS, f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms")
+                return TripCause.SENSORS, f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms"
             return None
         self._invalid = 0
         upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
         if upright < self._least_upright:
             tilt = degrees(acos(max(-1.0, upright)))
             reason = f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
-            return Trip(TripCause.ENVELOPE, reason)
+            return TripCause.ENVELOPE, reason
         if (speed := hypot(wx, wy, wz)) > limits.max_rate:
             reason = f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
-            return Trip(TripCause.ENVELOPE, reason)
+            return TripCause.ENVELOPE, reason
         self._saturated = self._saturated + 1 if max(map(abs, voltages)) >= self._full else 0
         if (saturated_s := self._saturated * self._period_ns * 1e-9) > limits.max_saturated_s:
-            return Trip(TripCause.SATURATION, f"a motor has been at its voltage limit for {saturated_s:.1f} s")
+            return TripCause.SATURATION, f"a motor has been at its voltage limit for {saturated_s:.1f} s"
         return None

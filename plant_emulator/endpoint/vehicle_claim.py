@@ -36,13 +36,6 @@ class Notice(NamedTuple):
     tick: int | None
 
 
-class Trip(NamedTuple):
-    """Cause of a trip, and the reason in words."""
-
-    cause: TripCause
-    reason: str
-
-
 class Freshness:
     """Judge of a session's commands: which of them are fresh, and whether the next one is overdue.
 

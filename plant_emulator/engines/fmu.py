@@ -60,9 +60,6 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
     start: dict[str, bool | int | float | str | list[float]] = Field(
         default={}, description="start values and parameters, by the FMU's names, in the FMU's units"
     )
-    log: bool = Field(
-        default=False, description="let the FMU log all that it can: its last message is shown where it fails; slower"
-    )
 
     @model_validator(mode="after")
     def _one_of_each(self) -> FmuSettings:
@@ -223,13 +220,7 @@ class FmuPlant(Plant):
         try:
             fmpy.extract(self._settings.file, self._folder.name)
             with chdir("."):  # FMPy changes the folder to load the library, and does not return where that fails
-                self._fmu = fmpy.instantiate_fmu(
-                    self._folder.name,
-                    self._description,
-                    "CoSimulation",
-                    debug_logging=self._settings.log,
-                    logger=self._log,
-                )
+                self._fmu = fmpy.instantiate_fmu(self._folder.name, self._description, "CoSimulation", logger=self._log)
             if self._fmi2:
                 self._fmu.setupExperiment(startTime=0.0)
             left = self._apply(self._settings.start, fmpy.simulation.settable_in_instantiated)
@@ -270,7 +261,7 @@ class FmuPlant(Plant):
             self._logged = (status, " ".join((text or b"").decode(errors="replace").split()))
 
     def _own_words(self) -> str:
-        return f": {self._logged[1]}" if self._logged[1] else "; it logged nothing: plant.own.log = true may say more"
+        return f": {self._logged[1]}" if self._logged[1] else ""
 
     def _failure(self, what: str, error: Exception) -> FmuError:
         if isinstance(error, FmuError):
@@ -335,10 +326,8 @@ def _description(file: Path) -> Any:
     platform = fmpy.platform if version == 2 else fmpy.platform_tuple
     library = f"binaries/{platform}/{description.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
     if library not in files:
-        others = sorted({name.split("/")[1] for name in files if re.match("binaries/[^/]+/.", name)})
-        sources = any(re.match(r"sources/.+\.c$", name) for name in files)
-        remedy = f"`fmpy compile {file}` builds one from its sources" if sources else "export it on this platform"
-        raise FmuError(f"{file.name} has no binary for {platform}, only for {', '.join(others) or 'none'}: {remedy}")
+        remedy = "export it on this platform, or `fmpy compile` it from its sources, if it has any"
+        raise FmuError(f"{file.name} has no binary for {platform}: {remedy}")
     return description
 
 

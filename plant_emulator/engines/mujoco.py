@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.model.emulated import Direction, RotorSettings
+from aeroloop.plant_emulator.model.emulated import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
@@ -36,9 +36,6 @@ class MujocoSettings(BaseModel, extra="forbid"):
     keyframe: str | None = Field(
         default=None, description="the model's keyframe to start from; its controls are those at 0 V, else 0"
     )
-    attitude: Direction | None = Field(
-        default=None, description="q of the body at the start [1]; for a body on a free or ball joint"
-    )
     allocation: list[list[float]] | None = Field(
         default=None,
         description="controls per volt, a row for each actuator of the model, a column for each voltage [control's "
@@ -47,7 +44,6 @@ class MujocoSettings(BaseModel, extra="forbid"):
     rotor: RotorSettings = Field(
         default=RotorSettings(lag_up_s=0.0, lag_down_s=0.0), description="lag and dead zone; by default neither"
     )
-    contacts: bool = Field(default=True, description="bodies collide, if the model's own flags let them")
     substeps: int | None = Field(
         default=None,
         ge=1,
@@ -78,10 +74,9 @@ class MujocoPlant(Plant):
         except ModuleNotFoundError:
             raise PluginError("this needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
         self._model = model = self._loaded(settings.model)
-        flags = self._mujoco.mjtDisableBit
-        model.opt.disableflags |= flags.mjDSBL_AUTORESET  # a state that is not finite is to be seen
-        if not settings.contacts:
-            model.opt.disableflags |= flags.mjDSBL_CONTACT
+        model.opt.disableflags |= (
+            self._mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        )  # a state that is not finite is to be seen
         self._substeps = settings.substeps or max(1, ceil(period / model.opt.timestep - 1e-9))
         model.opt.timestep = period / self._substeps
 
@@ -89,8 +84,6 @@ class MujocoPlant(Plant):
         if settings.keyframe is not None:
             self._mujoco.mj_resetDataKeyframe(model, data, self._found("key", settings.keyframe).id)
         self._body = int(self._found("body", settings.body).id)
-        if settings.attitude is not None:
-            self._turn(settings.attitude)
         self._at_rest = data.ctrl.copy()
         self._allocation = self._allocated(settings.allocation)
         self.actuators = self._allocation.shape[1]
@@ -168,21 +161,6 @@ class MujocoPlant(Plant):
         if len(allocation) != controls or len(widths) != 1 or 0 in widths:
             raise PluginError(f"allocation needs {controls} rows of one length: the MJCF has so many actuators")
         return np.array(allocation)
-
-    def _turn(self, attitude: Quaternion) -> None:
-        """Set the quaternion of the body's joint such that the body has this attitude."""
-        m, model, data = self._mujoco, self._model, self._data
-        joint = model.body_jntadr[self._body]
-        kind = m.mjtJoint(model.jnt_type[joint]) if joint >= 0 else None  # −1: the body is fixed
-        if kind not in (m.mjtJoint.mjJNT_FREE, m.mjtJoint.mjJNT_BALL):
-            raise PluginError("attitude sets that of a body on a free or ball joint; start others from a keyframe")
-        start = model.jnt_qposadr[joint] + (3 if kind == m.mjtJoint.mjJNT_FREE else 0)
-        quaternion = data.qpos[start : start + 4]
-        quaternion[:] = 1, 0, 0, 0
-        m.mj_kinematics(model, data)
-        back = np.empty(4)
-        m.mju_negQuat(back, data.xquat[self._body])
-        m.mju_mulQuat(quaternion, back, np.array(attitude) / np.linalg.norm(attitude))
 
     def _control(self, voltages: list[float]) -> None:
         """Set the controls [their units] for voltages at the rotors [V]."""

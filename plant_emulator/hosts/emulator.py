@@ -118,7 +118,8 @@ class EmulatorOnZenoh(Emulator):
         super().__init__(loop, wire, settings, role.stop)
         self._role = role
         self._steps: int | None = 0 if settings.steps_on_request else None  # steps left; None: no limit
-        self._truth_every = self._ticks_between_truths()
+        rate_hz = settings.truth_rate_hz
+        self._truth_every = max(1, round(loop.rate_hz / rate_hz)) if rate_hz else 0
 
     def run(self, network: PlantNetwork | None = None) -> None:
         """Run until the role stops; then set 0 V and publish a last status."""
@@ -145,10 +146,6 @@ class EmulatorOnZenoh(Emulator):
         if self._steps == 0:
             self._network.publish_status()  # ends the wait of the `advance` query's sender
         return arrival
-
-    def _ticks_between_truths(self) -> int:
-        rate = self._settings.truth_rate_hz
-        return max(1, round(self._loop.rate_hz / rate)) if rate else 0
 
     # ── queries `inject` and `advance`, for tests ──
 

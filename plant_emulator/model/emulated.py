@@ -64,10 +64,7 @@ class Mechanism(ABC):
         return x
 
 
-def _positive(values: Vector) -> Vector:
-    if not all(0 < value < inf for value in values):
-        raise ValueError("every moment of inertia must be positive and finite")
-    return values
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 def _with_a_direction(attitude: Quaternion) -> Quaternion:
@@ -83,7 +80,7 @@ Direction = Annotated[Quaternion, AfterValidator(_with_a_direction)]
 class BodySettings(BaseModel, extra="forbid"):
     """A body about a fixed point. Defaults: the inertia and mass of Table C.1."""
 
-    inertia: Annotated[Vector, AfterValidator(_positive)] = Field(
+    inertia: tuple[Positive, Positive, Positive] = Field(
         default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]"
     )
     mass: float = Field(default=1.075, gt=0, description="m [kg]")

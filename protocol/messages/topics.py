@@ -93,11 +93,6 @@ class Topic:
         """Whether roles answer queries on it."""
         return self.kind == "query" or self.name in ("description", "status")
 
-    @property
-    def title(self) -> str:
-        """Name of its schema."""
-        return self.model.__name__ if self.model else self.name.capitalize()
-
 
 TOPICS: Final = {
     topic.name: topic

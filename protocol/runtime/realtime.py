@@ -1,4 +1,4 @@
-"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, garbage between ticks, built parsers.
+"""Set-up of a real-time process: scheduling class, locked memory, CPU affinity, garbage between ticks, no lingering.
 
 Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
 second, which is warm-up, and stay. An idle CPU that sleeps takes long to wake; while a process keeps
@@ -10,6 +10,9 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import platform
+import socket
+import struct
 from errno import EINVAL
 from pathlib import Path
 from typing import Final
@@ -86,3 +89,42 @@ def collect_garbage() -> None:
     young, collected, older = gc.get_count()
     if young > _YOUNG and not gc.isenabled():
         gc.collect(0 if collected < _COLLECTIONS else 1 if older < _COLLECTIONS else 2)
+
+
+# ── sockets that do not linger ──
+
+_MACHINES: Final = {"x86_64": (0xC000003E, 54), "aarch64": (0xC00000B7, 208)}
+"""AUDIT_ARCH and the number of setsockopt, linux/audit.h and asm/unistd.h."""
+_PR_SET_SECCOMP, _PR_SET_NO_NEW_PRIVS, _MODE_FILTER = 22, 38, 2
+_LOAD, _IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # instructions of BPF
+_ALLOW, _DONE = 0x7FFF0000, 0x00050000  # SECCOMP_RET_ALLOW; SECCOMP_RET_ERRNO with no error
+
+
+class _Program(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_ushort), ("instructions", ctypes.c_char_p))
+
+
+def no_linger() -> str | None:
+    """Leave SO_LINGER off on all sockets of this thread and of threads and processes that it starts from now on.
+
+    Why: Zenoh sets it to 10 s on each (zenoh#2350, #2718, open). Closing a link whose peer no longer acknowledges then
+    blocks the thread that also carries other peers' frames. A filter of system calls (seccomp(2)) answers that one
+    setting with success and leaves it undone; it looks at nothing else.
+
+    Such processes get no privileges that this one does not have (`PR_SET_NO_NEW_PRIVS`). Returns why this host
+    refuses; None if it does not.
+    """
+    machine = _MACHINES.get(platform.machine())
+    if machine is None or platform.system() != "Linux":
+        return "sockets linger: no filter of system calls for this system"
+    # Offsets into struct seccomp_data: architecture, number of the call, its second and its third argument.
+    checks = (4, machine[0]), (0, machine[1]), (24, socket.SOL_SOCKET), (32, socket.SO_LINGER)
+    code = b""
+    for left, (offset, value) in zip((7, 5, 3, 1), checks, strict=True):  # instructions to skip if it differs
+        code += struct.pack("HBBI", _LOAD, 0, 0, offset) + struct.pack("HBBI", _IF_EQUAL, 0, left, value)
+    code += struct.pack("HBBI", _RETURN, 0, 0, _DONE) + struct.pack("HBBI", _RETURN, 0, 0, _ALLOW)
+    program = ctypes.byref(_Program(len(code) // 8, code))
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+    if prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) or prctl(_PR_SET_SECCOMP, _MODE_FILTER, program, 0, 0):
+        return f"sockets linger: filter of system calls: {os.strerror(ctypes.get_errno())}"
+    return None

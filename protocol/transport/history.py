@@ -43,12 +43,12 @@ Range = tuple[int, int]  # a number, and the one after the last
 
 
 class Delivery(NamedTuple):
-    """A received message; of one that has no number, `number` is 0, and its publisher and time [ns] are None."""
+    """A received message. Of one without a number, `number` is 0, `publisher` None, and its time that of arrival."""
 
     key: str
     payload: bytes
     number: int
-    published_ns: int | None
+    published_ns: int  # since 1970, on the publisher's wall clock
     publisher: int | None
 
 
@@ -61,9 +61,9 @@ def read_sample(sample: zenoh.Sample) -> Delivery:
     """Convert a sample of a cached publisher, or of any other."""
     key, payload, attached = str(sample.key_expr), sample.payload.to_bytes(), sample.attachment
     if attached is None or len(data := attached.to_bytes()) != _ATTACHMENT.size:
-        return Delivery(key, payload, 0, None, None)
+        return Delivery(key, payload, 0, time.time_ns(), None)
     clock_ns, publisher, number = _ATTACHMENT.unpack(data)
-    return Delivery(key, payload, number, clock_ns, publisher)
+    return Delivery(key, payload, number, max(0, clock_ns), publisher)
 
 
 def query(ranges: Sequence[tuple[int, Range]]) -> bytes:
@@ -260,7 +260,7 @@ class RecoveringSubscriber:
         while at + _ITEM.size <= len(data):
             number, clock_ns, length = _ITEM.unpack_from(data, at)
             at += _ITEM.size + length
-            found.append(Delivery(key, data[at - length : at], number, clock_ns, publisher))
+            found.append(Delivery(key, data[at - length : at], number, max(0, clock_ns), publisher))
         if at != len(data):
             return
         with self._lock:

@@ -1,4 +1,4 @@
-"""Functions of the public API: configuration, lockstep experiment, certificate, and a recorded run as arrays."""
+"""Public names: what a user's law, plant or test builds on; configuration, experiment, certificate, recorded runs."""
 
 from __future__ import annotations
 
@@ -9,15 +9,37 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from aeroloop.plant_emulator.plant import Plant
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.laws.interface import (
+    ExpressionLaw,
+    Gain,
+    Gains3,
+    LawSettings,
+    Now,
+    PositiveGain,
+    PythonLaw,
+    gravity_torque,
+    voltages_for,
+)
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import experiment
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review import review
+from aeroloop.service.testing.hil import Hil
 from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Certificate
+
+__all__ = [
+    "AeroloopError", "Certificate", "Controller", "ExpressionLaw", "Figures", "Gain", "Gains3", "Hil",
+    "HysteresisQuantizer", "LawSettings", "LogarithmicQuantizer", "Measurement", "Now", "Plant", "PositiveGain",
+    "PythonLaw", "RecordedRun", "Settings", "SignalSpec", "State", "Ticks", "UniformQuantizer", "WireSpec", "certify",
+    "gravity_torque", "load_settings", "read_run", "run_experiment", "voltages_for",
+]  # fmt: skip
 
 
 def load_settings(file: Path | str | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: options, configuration, one-line errors, figures as text or JSON."""
+"""Shared parts of the commands: options, configuration, one-line errors, processes that run until a signal."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial, wraps
-from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, NoReturn, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn, TypeVar
 
 import typer
 
@@ -30,7 +28,6 @@ log: Final = logging.getLogger("aeroloop")
 
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
-_PR_SET_PDEATHSIG: Final = 1
 PAPER_DURATION_S: Final = 50.0
 
 Result = TypeVar("Result", bound="BaseModel")
@@ -73,47 +70,7 @@ Require = Annotated[
         show_default=False,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Log only warnings and errors.")]
 LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
-WithParent = Annotated[int, typer.Option("--with-parent", metavar="PID", help="End with this process.", hidden=True)]
-
-
-class DaemonOptions(NamedTuple):
-    """Options that the command of every daemon has."""
-
-    config: Config = None
-    overrides: Overrides = None
-    quiet: Quiet = False
-    log_format: LogFormat = "text"
-    with_parent: WithParent = 0
-
-
-def daemon(role: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add the options of every daemon to the command of a role, which takes them as its first argument."""
-    return partial(_as_daemon, role)
-
-
-def _as_daemon(role: str, command: Callable[..., None]) -> Callable[..., None]:
-    own = list(signature(command).parameters.values())[1:]
-    shared = [Parameter(name, Parameter.KEYWORD_ONLY, default=value) for name, value in _DEFAULTS.items()]
-    hints = get_type_hints(command, include_extras=True) | get_type_hints(DaemonOptions, include_extras=True)
-
-    @wraps(command)
-    def with_options(**arguments: Any) -> None:
-        options = DaemonOptions(**{name: arguments.pop(name) for name in _DEFAULTS})
-        from aeroloop.service.terminal.log_lines import set_up_logging
-
-        set_up_logging(logging.WARNING if options.quiet else logging.INFO, as_json=options.log_format == "json")
-        logged_as[:] = [role] if options.log_format == "json" else []
-        command(options, **arguments)
-
-    parameters = [each.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[each.name]) for each in (*own, *shared)]
-    with_options.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
-    with_options.__annotations__ = {each.name: hints[each.name] for each in parameters}
-    return with_options
-
-
-_DEFAULTS: Final = DaemonOptions()._asdict()
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -185,24 +142,67 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
     """Build values of these models from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
 
+    from aeroloop.protocol.wording import problem
+
     try:
         yield
-    except (ValidationError, AeroloopError) as error:
+    except (ValueError, AeroloopError) as error:
         if state["debug"]:
             raise
-        if isinstance(error, AeroloopError):
-            fail(str(error), 2)
-        from aeroloop.protocol.wording import problem
-
-        fail(problem(error, *models), 2)
+        fail(problem(error, *models) if isinstance(error, ValidationError) else str(error), 2)
 
 
-def run_role(kind: str, settings: Settings, run: Callable[[Node], None], options: DaemonOptions) -> None:
+def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
+    """Print a result, as JSON or by a function that prints it for a person."""
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        table(result)
+
+
+def check_engine(engine: str) -> None:
+    """Exit with 2 unless an engine can be used."""
+    from aeroloop.service.lab import sweep
+
+    with checked():
+        sweep.check_engine(engine)
+
+
+def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
+    """Check where a figure is to be drawn, if one is. Raises as `check_path` and `check_output` do."""
+    if figure is not None:
+        from aeroloop.service.logs.outputs import check_output
+        from aeroloop.service.report.figure_style import check_path
+
+        check_path(figure)
+        check_output(figure, [config], force=force)
+
+
+@contextmanager
+def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
+    """A path to write to, once the table is printed: a full disk must not cost the table."""
+    from aeroloop.service.logs.outputs import writing
+
+    with guarded(), writing(path, [config], force=force) as part:
+        yield part
+
+
+# ── processes that run until a signal ──
+
+
+def log_as(role: str, log_format: str) -> None:
+    """Log to stderr, as lines of text or of JSON; an error that ends the daemon is logged in the same form."""
+    from aeroloop.service.terminal.log_lines import set_up_logging
+
+    set_up_logging(as_json=log_format == "json")
+    logged_as[:] = [role] if log_format == "json" else []
+
+
+def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
-    _follow_parent(options)
     begun, stop = _stop_on_signals()
     from aeroloop.protocol.runtime.node import Node
-    from aeroloop.protocol.transport.lingering import no_linger
+    from aeroloop.protocol.runtime.realtime import no_linger
     from aeroloop.protocol.transport.zenoh_config import THREADS
     from aeroloop.service.daemon.claim import controller_name
 
@@ -215,9 +215,8 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None], options
         run(role)
 
 
-def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
+def run_alone(run: Callable[[Event], None]) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
-    _follow_parent(options)
     begun, stop = _stop_on_signals()
     begun.set()
     with guarded():
@@ -245,48 +244,3 @@ def _stop_on_signals() -> tuple[Event, Event]:
 
     Thread(target=wait, daemon=True).start()
     return begun, stop
-
-
-def _follow_parent(options: DaemonOptions) -> None:
-    if options.with_parent:
-        import ctypes
-        import os
-
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != options.with_parent:  # the parent ended before prctl took effect
-            raise typer.Exit(0)
-
-
-def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
-    """Print a result, as JSON or by a function that prints it for a person."""
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    else:
-        table(result)
-
-
-def check_engine(engine: str) -> None:
-    """Exit with 2 unless an engine can be used."""
-    from aeroloop.service.lab import workers
-
-    with checked():
-        workers.check_engine(engine)
-
-
-def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
-    """Check where a figure is to be drawn, if one is. Raises as `check_path` and `check_output` do."""
-    if figure is not None:
-        from aeroloop.service.logs.outputs import check_output
-        from aeroloop.service.report.figure_style import check_path
-
-        check_path(figure)
-        check_output(figure, [config], force=force)
-
-
-@contextmanager
-def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
-    """A path to write to, once the table is printed: a full disk must not cost the table."""
-    from aeroloop.service.logs.outputs import writing
-
-    with guarded(), writing(path, [config], force=force) as part:
-        yield part

@@ -7,22 +7,16 @@ before that ends a daemon at once, with a line.
 
 from __future__ import annotations
 
-import _signal  # type: ignore[import-not-found]  # what `signal` wraps: it imports enum, during which ^C is a traceback
 import io
 import os
+import signal
 import sys
 
 INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
 
-DAEMONS = {"controller", "emulator", "plant", "bridge", "can-node", "router", "recorder"}
+DAEMONS = {"controller", "emulator", "plant", "can-node", "router", "recorder"}
 """Verbs that run until SIGTERM, with exit code 0."""
-
-SWITCHES = {
-    "OPENBLAS_NUM_THREADS": "1",  # NumPy would start a thread for each core, which no matrix here is large enough for
-    "PYDANTIC_DISABLE_PLUGINS": "__all__",  # to find some, it would read the metadata of every installed package
-}
-"""Environment of libraries, which read it at their import, unless it is set. What no command needs costs 75 ms."""
 
 
 def end_at_once(*_: object) -> None:
@@ -41,10 +35,11 @@ def end_unstarted(*_: object) -> None:
 def main() -> None:
     """Entry point of the command."""
     if not DAEMONS.isdisjoint(sys.argv[1:2]):
-        _signal.signal(_signal.SIGTERM, end_unstarted)
-    if _signal.getsignal(_signal.SIGINT) is not _signal.SIG_IGN:  # as in a background job
-        _signal.signal(_signal.SIGINT, end_at_once)
-    for switch, value in SWITCHES.items():
+        signal.signal(signal.SIGTERM, end_unstarted)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in a background job
+        signal.signal(signal.SIGINT, end_at_once)
+    # No matrix here is worth a thread on each core; for plug-ins pydantic would read every package's metadata.
+    for switch, value in (("OPENBLAS_NUM_THREADS", "1"), ("PYDANTIC_DISABLE_PLUGINS", "__all__")):
         os.environ.setdefault(switch, value)
     from aeroloop.service.cli.main import execute
 

@@ -1,15 +1,30 @@
-"""`aeroloop host`: checks this machine, installs its daemons."""
+"""`aeroloop host`: checks this machine, installs its daemons, makes its keys."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, guarded, settings_of, show
+from aeroloop.service.cli.common import Config, Json, Overrides, address_of, checked, guarded, settings_of
+
+DEFAULT_KEYS: Final = Path("~/.config/aeroloop/keys")
+"""Directory where none is configured."""
+
+Directory = Annotated[
+    Path | None,
+    typer.Option(
+        "--directory", help="Folder; network.security.directory if configured, else ~/.config/aeroloop/keys.",
+        show_default=False,
+    ),
+]  # fmt: skip
 
 group = typer.Typer()
+keys = typer.Typer()
+group.add_typer(
+    keys, name="keys", help="Certificates of this host's roles, for mutual TLS between hosts.", no_args_is_help=True
+)
 
 
 @group.command()
@@ -21,15 +36,20 @@ def doctor(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Check whether this machine holds the configured rate, and its certificates; print what to change if not."""
+    """Check whether this machine holds the configured rate. Checks its certificates, too, and prints what to change."""
     settings = settings_of(config, overrides)
     from aeroloop.service.host.doctor import CHECK_S, diagnose
-    from aeroloop.service.terminal.display import diagnosis_table, progress_bar
+    from aeroloop.service.terminal.display import progress_bar
+    from aeroloop.service.terminal.sheets import MARKS, diagnosis_sheets
+    from aeroloop.service.terminal.show import show_all
 
     with guarded(), progress_bar("check", CHECK_S, hidden=json) as update:
         tried = settings.network if network else None
         diagnosis = diagnose(settings.loop, update, settings.network.security.folder, tried)
-    show(diagnosis, json, diagnosis_table)
+    if json:
+        typer.echo(diagnosis.model_dump_json(indent=2))
+    else:
+        show_all(diagnosis_sheets(diagnosis), keys=2, styles=MARKS)
     if not diagnosis.holds:
         raise typer.Exit(1)
 
@@ -43,9 +63,9 @@ def units(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print systemd units for the daemons of this configuration, or install them; ends with the commands to start them.
+    """Print systemd units for the configured daemons, or install them.
 
-    The configuration is /etc/aeroloop/aeroloop.toml unless --config names another.
+    Ends with the commands that start them. The configuration is /etc/aeroloop/aeroloop.toml unless --config names one.
     """
     from aeroloop.service.host import units
 
@@ -61,3 +81,75 @@ def units(
     typer.echo("# next:")
     for step in units.next_steps(install, source):
         typer.echo(f"#   {step}" if install is None else step)
+
+
+@keys.command()
+def init(
+    days: Annotated[int, typer.Option(min=1, max=36500, help="How long the authority is valid, in days.")] = 3650,
+    directory: Directory = None,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Make an authority that signs this network's certificates. Its key, ca.key, stays in the folder."""
+    folder = _folder(directory, config, overrides)
+    from aeroloop.service.host import keys
+
+    with guarded():
+        typer.echo(keys.init(folder, days))
+    typer.echo(
+        f"next: `aeroloop host keys issue ROLE NAME`, and in every configuration [network.security] directory = "
+        f'"{folder}"',
+        err=True,
+    )
+
+
+@keys.command()
+def issue(
+    role: Annotated[str, typer.Argument(help="plant, controller, operator, observer, recorder, router.")],
+    name: Annotated[str, typer.Argument(help="Host or person that gets it.")],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(help="Its vehicle, which plant and controller need; every vehicle if none.", show_default=False),
+    ] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificate is valid, in days.")] = 90,
+    directory: Directory = None,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Issue a certificate with a new key. 90 days, because none can be revoked: a stolen key is good until then."""
+    folder = _folder(directory, config, overrides)
+    from aeroloop.service.host import keys
+
+    with guarded():
+        typer.echo(keys.issue(folder, role, name, vehicle, days))
+
+
+@keys.command("show")
+def show_keys(
+    json: Json = False, directory: Directory = None, config: Config = None, overrides: Overrides = None
+) -> None:
+    """Print this host's certificates and their authority. Exits with 1 if one cannot be used."""
+    folder = _folder(directory, config, overrides)
+    from aeroloop.service.host import keys
+
+    with guarded():
+        files = keys.show(folder)
+    if json:
+        from json import dumps
+
+        typer.echo(dumps([file.model_dump(mode="json") for file in files], indent=2))
+    else:
+        from aeroloop.service.terminal.sheets import MARKS, key_sheets
+        from aeroloop.service.terminal.show import show_all
+
+        show_all(key_sheets(str(folder), files), keys=2, styles=MARKS)
+    if any(file.problem for file in files):
+        raise typer.Exit(1)
+
+
+def _folder(given: Path | None, config: Path | None, overrides: list[str] | None) -> Path:
+    """The folder that is given, else the configured one, else the default."""
+    if given is None:
+        with checked():
+            given = address_of(config, overrides).network.security.folder or DEFAULT_KEYS
+    return given.expanduser().absolute()

@@ -1,24 +1,116 @@
-"""`aeroloop lab`: experiments, tables, calibration and certificates, in lockstep and without a network."""
+"""`aeroloop lab`: experiments, tables, grids, searches and certificates, in lockstep and without a network."""
 
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from aeroloop.service.cli.common import (
+    PAPER_DURATION_S,
     BitsIn,
     BitsOut,
     Config,
+    Duration,
+    EngineOption,
+    Force,
     Json,
+    Markdown,
     Overrides,
+    check_engine,
+    check_figure,
+    checked,
     guarded,
     loop_of,
+    new_file,
+    show,
     with_bits_of,
 )
-from aeroloop.service.cli.lab_experiments import burden, calibrate, experiment, sweep, tables
-from aeroloop.service.cli.lab_laws import laws, tune
+from aeroloop.service.cli.entry import INTERRUPTED
+
+# Modules of the lab are imported where they are used, as `--help` must not wait for them.
+
+_Bits = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--bits",
+        metavar="OUT/IN",
+        help="Bits of ε and ω, and of u, such as 8/6 or cont/cont; may be repeated; six pairs if left out, for laws "
+        "8/6 and cont/cont.",
+        show_default=False,
+    ),
+]
+_Sensors = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sensors",
+        metavar="NAME",
+        help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; all four if "
+        "left out, for laws encoders. A free body has no encoders: perfect.",
+        show_default=False,
+    ),
+]
+_Seeds = Annotated[
+    int, typer.Option("--seeds", min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
+]
+_Figure = Annotated[
+    Path | None,
+    typer.Option("--figure", help="Draw the result: a .png, .svg or .pdf file.", show_default=False),
+]
+_ROWS = "Table of all experiments. Rows are kept in FILE.jsonl as they come: the same command goes on there."
+_TABLE = "FILE.parquet|FILE.csv"
+
+
+def experiment(
+    duration: Duration = PAPER_DURATION_S,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the closed loop in this process, in lockstep, without a network."""
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    from aeroloop.service.lab.experiment import run_experiment
+    from aeroloop.service.terminal.display import figures_table, progress_bar
+
+    with guarded(), progress_bar("experiment", duration, hidden=json) as update:
+        figures = run_experiment(settings, duration, update)
+    show(figures, json, figures_table)
+
+
+def tables(
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    engine: EngineOption = "processes",
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.tables import predict, sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with guarded(), count_bar("cells", hidden=json) as update:
+        result = predict(settings, seeds, update, engine)
+    show_result(result, sheets, json=json, markdown=markdown)
+
+
+def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
+    settings = loop_of(config, overrides)
+    from aeroloop.service.lab.tables import calibrate, calibration_sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = calibrate(settings, lambda runs: update(runs, None))
+    show_result(result, calibration_sheets, json=json)
 
 
 def certify(
@@ -51,7 +143,7 @@ def certify(
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.terminal.certificate_table import certificate_sheets
+    from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.terminal.show import show_result
     from aeroloop.service.theorem.any_law import certify_any
 
@@ -59,6 +151,223 @@ def certify(
         result = certify_any(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
     show_result(result, partial(certificate_sheets, verbose=verbose), json=json)
     raise typer.Exit(0 if result.holds else 1)
+
+
+def burden(
+    bits: _Bits = None,
+    quantizer: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
+            "the rest); may be repeated; all four if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: _Sensors = None,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    figure: _Figure = None,
+    force: Force = False,
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with checked():
+        check_figure(figure, config, force)
+        cells = grid(settings, bits or (), quantizer or (), sensors or ())
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = measure_burden(settings, cells, duration, update, engine)
+    show_result(result, sheets, json=json, markdown=markdown, keys=2)
+    if figure is not None:
+        with new_file(figure, config, force) as part:
+            draw_burden(result, part)
+
+
+def laws(
+    law: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    bits: _Bits = None,
+    sensors: _Sensors = None,
+    wind: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="calm or wind; may be repeated; both if left out.", show_default=False),
+    ] = None,
+    plant: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="aero, rigid_body (a free body like it, with three motors), or a plant of your own, as plant.kind "
+            "takes it; may be repeated; the first two if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    within: Annotated[
+        float,
+        typer.Option(
+            metavar="DEG", min=0.1, max=180, help="Error up to which delay and lost frames count as survived."
+        ),
+    ] = 10.0,
+    seeds: _Seeds = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    out: Annotated[Path | None, typer.Option(metavar=_TABLE, help=_ROWS, show_default=False)] = None,
+    figure: _Figure = None,
+    force: Force = False,
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.laws import compare, draw_laws, run_comparison, sheets
+    from aeroloop.service.lab.sweep import check_table
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    axes = {"laws": law, "bits": bits, "sensors": sensors, "winds": wind, "plants": plant}
+    given = {name: values or () for name, values in axes.items()}
+    with checked():
+        check_figure(figure, config, force)
+        comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
+        if out is not None:
+            check_table(out, comparison.plan, [config], force=force, within_deg=within)
+    with guarded(), count_bar("experiments and searches", hidden=json) as update:
+        result = run_comparison(comparison, out, engine, update)
+    show_result(result, sheets, json=json, markdown=markdown)
+    if figure is not None:
+        with new_file(figure, config, force) as part:
+            draw_laws(result, part)
+
+
+def sweep(
+    out: Annotated[Path, typer.Option(metavar=_TABLE, help=_ROWS, show_default=False)],
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUES",
+            help="section.key=a,b,c or section.key=a..b*n, n values evenly from a to b; may be repeated, for every "
+            "combination.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: _Seeds = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    force: Force = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run an experiment for every combination of values and seeds, and write a table of their figures."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.axes import configurations, parse_axes
+    from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with checked():
+        axes = parse_axes(vary or ())
+        planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
+        check_table(out, planned, [config], force=force)
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = run_sweep(planned, out, engine=engine, progress=update)
+    show_result(result, sheets, json=json)
+
+
+def tune(
+    gain: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Gain, or other number of the law's settings; may be repeated; all of the law's gains if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    scale: Annotated[
+        bool, typer.Option("--scale", help="Keep the ratio between a gain's axes: fewer dimensions.")
+    ] = False,
+    weight: Annotated[float, typer.Option(min=0, help="Of u_total beside z_track in the cost, in 1/V².")] = 1e-7,
+    max_saturated: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Largest part of the ticks with a voltage at its limit; 1.25 × the configured gains' if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    max_chatter: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Most changes of a voltage a second; 1.25 × the configured gains' if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds of wind and sensors.")] = 2,
+    winds: Annotated[
+        str, typer.Option(metavar="A,B", help="Training winds, as parts of plant.wind.torque; 0 is calm.")
+    ] = "0,1",
+    held_out: Annotated[
+        int, typer.Option(min=1, max=100, help="Runs with other seeds and winds, which the search does not see.")
+    ] = 4,
+    budget: Annotated[int, typer.Option(min=1, help="Experiments of the search, at most.")] = 1000,
+    duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 10.0,
+    reach: Annotated[float, typer.Option(min=1.01, help="Largest factor of a gain, up or down.")] = 10.0,
+    within: Annotated[
+        float, typer.Option(metavar="DEG", min=0, help="Bound of the attitude error with delay or lost frames.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed finds the same.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.", show_default=False)
+    ] = None,
+    engine: EngineOption = "processes",
+    force: Force = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.sweep import open_workers
+    from aeroloop.service.lab.tune import TuneOptions, parse_winds, sheets, toml_of, tune
+    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with checked():
+        if out is not None:
+            check_output(out, [config], force=force)
+        options = TuneOptions(
+            gain or (), scale, weight, max_saturated, max_chatter, seeds, parse_winds(winds), held_out, budget,
+            duration, reach, seed, within,
+        )  # fmt: skip
+    with guarded(), count_bar("experiments", hidden=json) as update, open_workers(engine) as workers:
+        found = tune(settings, options, workers, update)
+    show_result(found, sheets, json=json)
+    if out is not None:
+        with new_file(out, config, force) as part:
+            part.write_text(toml_of(found), encoding="utf-8")
+    raise typer.Exit(INTERRUPTED if found.interrupted else 1 if found.worse else 0)
 
 
 group = typer.Typer()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,7 +11,6 @@ import typer
 
 from aeroloop.service.cli.common import (
     Config,
-    DaemonOptions,
     Force,
     Json,
     Overrides,
@@ -22,30 +22,26 @@ from aeroloop.service.cli.common import (
     settings_of,
     show,
 )
-from aeroloop.service.cli.compare import Html, check_page, compare, write_html
 
 if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.recover import Recovery
+    from aeroloop.service.review.report import Report
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
-
+Html = Annotated[
+    Path | None, typer.Option("--html", help="Write an interactive page that needs no network.", show_default=False)
+]
 Vehicle = Annotated[
     str | None,
     typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.", show_default=False),
 ]
+Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
+Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
 
 group = typer.Typer()
-
-
-def _part(since_s: float | None, until_s: float | None, until: str) -> tuple[float, float]:
-    """From when to when to read, on the law's clock [s]; exits with 2 if that is no time. `until` names the option."""
-    part = -inf if since_s is None else since_s, inf if until_s is None else until_s
-    if part[0] >= part[1]:
-        fail(f"--from {part[0]:g} is not before {until} {part[1]:g}", 2)
-    return part
 
 
 @group.command()
@@ -55,12 +51,8 @@ def review(
         Path | None,
         typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
     ] = None,
-    since_s: Annotated[
-        float | None, typer.Option("--from", metavar="S", help="Review from this time on only.", show_default=False)
-    ] = None,
-    until_s: Annotated[
-        float | None, typer.Option("--to", metavar="S", help="Review to this time only.", show_default=False)
-    ] = None,
+    since_s: Since = -inf,
+    until_s: Until = inf,
     require: Require = None,
     session: Annotated[
         str | None,
@@ -71,40 +63,90 @@ def review(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Compute every figure of a run from its logs, check limits, and draw the paper's figures."""
+    """Compute every figure of a run from its logs. Checks limits, and draws the paper's figures."""
     from aeroloop.service.review.requirements import Limit, broken_limits
 
     with checked():
         limits = [Limit.parse(text) for text in require or []]
-    if html is not None:
-        check_page(html, logs, force)
+    _check_page(html, logs, force)
 
     from aeroloop.service.logs.outputs import writing_into
     from aeroloop.service.review.review import read
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import review_account
 
-    begin_s, end_s = _part(since_s, until_s, "--to")
+    _check_part(since_s, until_s, "--to")
     with guarded():
         with share_bar("reading", hidden=json) as update:
-            judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=begin_s, until_s=end_s)
-        report = judged.report(limits)
+            judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
         if figures is not None:
             from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(report, judged.settings, folder)
+                drawn = draw_figures(judged.report(), judged.settings, folder)
             names = ", ".join(dict.fromkeys(path.stem for path in drawn))
             typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:
-            write_html([report], html, logs, force)
-        findings = report.findings
+            write_html([judged.report(limits)], html, logs, force)
+    findings = judged.checked(limits)
     show(findings, json, review_account)
     if broken := broken_limits(findings):
         fail("; ".join(broken), 1)
 
 
-group.command()(compare)
+@group.command()
+def compare(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.", show_default=False)],
+    html: Html = None,
+    require: Require = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Compare figures and configurations of several runs."""
+    from aeroloop.service.review.requirements import Limit, broken_limits
+
+    if len(logs) < 2:
+        fail("log compare takes two logs or more", 2)
+    with checked():
+        limits = [Limit.parse(text) for text in require or []]
+    _check_page(html, logs, force)
+
+    from aeroloop.service.review.compare import Comparison, read_runs
+    from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.terminal.log_tables import comparison_tables
+
+    with guarded():
+        with share_bar("reading", hidden=json) as update:
+            reports = read_runs(logs, limits, update)
+        if html is not None:
+            write_html(reports, html, logs, force)
+    show(Comparison.of(reports), json, lambda _: comparison_tables(reports))
+    if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
+        fail("; ".join(broken), 1)
+
+
+def _check_part(since_s: float, until_s: float, option: str) -> None:
+    if since_s >= until_s:
+        fail(f"--from {since_s:g} is not before {option} {until_s:g}", 2)
+
+
+def _check_page(out: Path | None, logs: Sequence[Path], force: bool) -> None:
+    """Check, before the logs are read, that their page may be written; else the command ends."""
+    if out is not None:
+        from aeroloop.service.logs.outputs import check_output
+
+        with guarded():
+            check_output(out, logs, force=force)
+
+
+def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
+    """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
+    from aeroloop.service.logs.outputs import writing
+    from aeroloop.service.report.page import page
+
+    with writing(out, logs, force=force) as part:
+        part.write_text(page(reports), encoding="utf-8")
+    typer.echo(f"aeroloop: wrote {out}", err=True)
 
 
 @group.command()
@@ -117,16 +159,19 @@ def replay(
         Literal["controller", "plant"] | None,
         typer.Option("--end", help="Only this end; both if left out.", show_default=False),
     ] = None,
+    since_s: Since = -inf,
+    until_s: Until = inf,
     json: Json = False,
 ) -> None:
-    """Compute both ends again from their traces and compare byte for byte; exit with 1 unless all of it is the same."""
+    """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
     from aeroloop.protocol.messages.trace import ENDS
     from aeroloop.service.logs.replay import replay
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import replay_table
 
+    _check_part(since_s, until_s, "--to")
     with guarded(), share_bar("replaying", hidden=json) as update:
-        replayed = replay(logs, overrides or [], update, ends=[end] if end else ENDS)
+        replayed = replay(logs, overrides or [], update, [end] if end else ENDS, since_s, until_s)
     show(replayed, json, replay_table)
     if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)
@@ -139,7 +184,7 @@ def recover(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Copy the whole records of a broken log into a new log and report what was lost."""
+    """Copy what is whole of a broken log into a new one. Reports what was lost."""
     from aeroloop.service.logs.recover import recover
     from aeroloop.service.terminal.display import share_bar
 
@@ -166,7 +211,7 @@ def live(
     vehicle = settings.vehicle
 
     def ready(url: str) -> None:
-        layout = f"aeroloop show layout --vehicle {vehicle}"
+        layout = f"aeroloop show layout --set vehicle={vehicle}"
         typer.echo(f"{vehicle} at {url} for Foxglove and Lichtblick, until ^C; `{layout}` prints a layout to import")
 
     def run(stop: Event) -> None:
@@ -174,7 +219,7 @@ def live(
 
         serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
 
-    run_alone(run, DaemonOptions())
+    run_alone(run)
 
 
 @group.command()
@@ -190,16 +235,14 @@ def export(
         typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.", show_default=False),
     ] = None,
     vehicle: Vehicle = None,
-    since_s: Annotated[
-        float | None, typer.Option("--from", metavar="S", help="Rows from this time on only.", show_default=False)
-    ] = None,
+    since_s: Since = -inf,
     until_s: Annotated[
-        float | None, typer.Option("--until", metavar="S", help="Rows to this time only.", show_default=False)
-    ] = None,
+        float, typer.Option("--until", metavar="S", help="To this time only.", show_default=False)
+    ] = inf,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Write a log as a table with a row per tick or, with --to mcap, as a log with every message decoded."""
+    """Write a log as a table with a row for each tick. With --to mcap: a log with every message decoded."""
     from aeroloop.service.logs.export import export
     from aeroloop.service.terminal.display import share_bar
 
@@ -213,7 +256,7 @@ def export(
         for one in exported.unknown:
             typer.echo(str(one))
 
-    times_s = _part(since_s, until_s, "--until")
+    _check_part(since_s, until_s, "--until")
     with guarded(), share_bar("exporting", hidden=json) as update:
         exported = export(
             logs,
@@ -221,8 +264,8 @@ def export(
             out,
             session=session,
             vehicle=vehicle,
-            since_s=times_s[0],
-            until_s=times_s[1],
+            since_s=since_s,
+            until_s=until_s,
             force=force,
             progress=update,
         )

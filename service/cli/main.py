@@ -7,28 +7,23 @@ configuration, 1 for a failed run, 130 for ^C.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from difflib import get_close_matches
 from itertools import takewhile
-from typing import Annotated, Final, cast
+from typing import Annotated, Final
 
-import typer.main
+import typer
 from typer.exceptions import TyperException
 
+from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import logged_as, report, state
 from aeroloop.service.cli.entry import INTERRUPTED
-from aeroloop.service.cli.groups import Group
 
 _GROUPS: Final = {
-    "lab": "Experiments, tables, calibration and certificates, in lockstep.",
-    "log": "Review, compare, replay, recover and export logs; view a live loop.",
-    "op": "Operate running roles over the network.",
-    "host": "Check this machine, install its daemons, make its keys.",
-    "show": "Print the configuration, the wire, a DBC file, a layout, examples.",
+    "lab": (lab.group, "Experiments, tables, calibration and certificates, in lockstep."),
+    "log": (log.group, "Review, compare, replay, recover and export logs; view a live loop."),
+    "op": (op.group, "Operate running roles over the network."),
+    "host": (host.group, "Check this machine, install its daemons, make its keys."),
+    "show": (show.group, "Print the configuration, the wire, a DBC file, a layout, examples."),
 }
-"""Modules of verbs in this folder, with the help of each. Those of `run` stand beside the groups."""
-
-_KEYS: Final = "Certificates of this host's roles, for mutual TLS between hosts."
-"""Help of the group `keys`, which stands in `host`."""
 
 _EXTRAS: Final = {
     "can": ("python-can", "can"),
@@ -43,19 +38,31 @@ _EXTRAS: Final = {
 }
 """Modules that the core installs without: the package, and the extra that brings it."""
 
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+    help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
+)
+app.add_typer(run.group)
+for _name, (_group, _help) in _GROUPS.items():
+    app.add_typer(_group, name=_name, help=_help, no_args_is_help=True)
+
 
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code. Any error is one line on stderr."""
     state["debug"] = False
     logged_as.clear()
     try:
-        return root().main(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
+        return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
-        if message := _reason(error):  # empty where no verb was given and help was printed
-            context = getattr(error, "ctx", None)
+        message, context = error.format_message(), getattr(error, "ctx", None)
+        if message.startswith("Usage: "):  # help, where no verb was given
+            typer.echo(message, err=True)
+        else:
             words = takewhile(lambda word: not word.startswith("-"), arguments[:2])
             command = context.command_path if context else " ".join(["aeroloop", *words])
-            typer.echo(f"aeroloop: {message.rstrip('.')}{_alike(error)} (see `{command} --help`)", err=True)
+            typer.echo(f"aeroloop: {_words(message)} (see `{command} --help`)", err=True)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
@@ -64,55 +71,26 @@ def execute(arguments: Sequence[str]) -> int:
             raise
         if isinstance(error, ModuleNotFoundError) and (missing := _EXTRAS.get((error.name or "").partition(".")[0])):
             package, extra = missing
-            typer.echo(
-                f"aeroloop: this needs {package}, which is not installed: pip install 'aeroloop[{extra}]'", err=True
-            )
-            return 1
-        text = f"{type(error).__name__}: {error}".splitlines()[0]
-        report(f"unexpected {text}; `aeroloop --debug …` shows where")
+            report(f"this needs {package}, which is not installed: pip install 'aeroloop[{extra}]'")
+        else:
+            text = f"{type(error).__name__}: {error}".splitlines()[0]
+            report(f"unexpected {text}; `aeroloop --debug …` shows where")
         return 1
 
 
-_MUST_BE: Final = {
-    "float_parsing": "must be a number",
-    "int_parsing": "must be a whole number",
-    "greater_than_equal": "must be at least {ge}",
-    "less_than_equal": "must be at most {le}",
-    "value_error": "{error}",
-}
-"""By the type of pydantic's errors, what the value of an option or an argument must be."""
-
-
-def _reason(error: TyperException) -> str:
-    """What is wrong with a command line: pydantic's and Typer's own words are for programmers."""
-    if alike := getattr(error, "possibilities", None):
-        return f"No such option: {getattr(error, 'option_name', '')}; did you mean {' or '.join(sorted(alike))}?"
-    parameter, cause = getattr(error, "param", None), error.__cause__
-    if parameter is not None and cause is not None:
-        from pydantic_core import ValidationError
-
-        found = cause.errors()[0] if isinstance(cause, ValidationError) else None
-        if found and (text := _MUST_BE.get(found["type"])):
-            name = parameter.opts[0] if parameter.opts else parameter.name
-            given = "" if found["type"] == "value_error" else f", not {found['input']!r}"
-            joint = ":" if found["type"] == "value_error" else ""
-            return f"{name}{joint} {text.format(**found.get('ctx', {}))}{given}"
-    return error.format_message()
-
-
-def _alike(error: TyperException) -> str:
-    """The commands that an unknown verb may stand for, in its own group if any is there, else in another."""
-    context = getattr(error, "ctx", None)
-    if context is None or not error.message.startswith("No such command"):
-        return ""
-    top = context.find_root().command
-    groups = {name: top.get_command(context, name).list_commands(context) for name in _GROUPS}
-    paths = [*top.list_commands(context), *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)]
-    wrong, verbs = error.message.split("'")[1], {path.split()[-1] for path in paths}
-    alike = [wrong] if wrong in verbs else get_close_matches(wrong, verbs)
-    found = [f"aeroloop {path}" for path in paths if path.split()[-1] in alike]
-    own = [command for command in found if command.rpartition(" ")[0] == context.command_path]
-    return f"; did you mean `{'` or `'.join(own or found)}`?" if found else ""
+def _words(message: str) -> str:
+    """What is wrong with a command line, in one line; a verb without its group is found: `aeroloop op stop`."""
+    if message.startswith("No such command"):
+        verb = message.split("'")[1]
+        paths = [
+            f"`aeroloop {name} {verb}`"
+            for name, (group, _) in _GROUPS.items()
+            for each in group.registered_commands
+            if verb == (each.name or getattr(each.callback, "__name__", None))
+        ]
+        if paths:
+            return f"No such command '{verb}'; did you mean {' or '.join(paths)}?"
+    return " ".join(message.split()).rstrip(".")
 
 
 def _print_version(requested: bool) -> None:
@@ -126,32 +104,11 @@ def _print_version(requested: bool) -> None:
         raise typer.Exit(0)
 
 
-def root() -> Group:
-    """The command `aeroloop`, with its options, groups and verbs."""
-    app = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        suggest_commands=False,  # `_alike` does, across groups
-        context_settings={"help_option_names": ["-h", "--help"]},
-        help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
-    )
-    app.callback()(_options)
-    command = cast(Group, typer.main.get_command(app))
-    groups = {
-        name: Group(name=name, module=name, help=text, no_args_is_help=True, suggest_commands=False)
-        for name, text in (*_GROUPS.items(), ("keys", _KEYS))
-    }
-    groups["host"].add_command(groups.pop("keys"))
-    for group in groups.values():
-        command.add_command(group)
-    return command
-
-
+@app.callback()
 def _options(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[  # noqa: ARG001  # its callback prints and ends
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
     ] = False,
 ) -> None:
-    """Options of every command."""
     state["debug"] = debug

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from shlex import join
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 
@@ -13,6 +14,7 @@ from aeroloop.service.cli.common import Config, Json, Overrides, address_of, che
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from aeroloop.protocol.messages.models import SessionRecord
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
     from aeroloop.service.vehicle_address import VehicleAddress
 
@@ -23,6 +25,9 @@ Within = Annotated[
         "--in", metavar="S", help="Time to get there, in s; too short a time is refused, and the shortest named."
     ),
 ]
+
+WITHIN_S: Final = 2.0
+"""To reach a reference, unless --in says how long [s]."""
 
 group = typer.Typer()
 
@@ -43,7 +48,7 @@ def status(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print the status of every role of every vehicle on the network; exits with 1 if no role answers."""
+    """Print the status of every role on the network. Exits with 1 if no role answers."""
     address = address_of(config, overrides)
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
@@ -75,24 +80,11 @@ def status(
 def top(config: Config = None, overrides: Overrides = None) -> None:
     """Show every vehicle and role on the network, live; q quits."""
     address = address_of(config, overrides)
-    import threading
-
-    from aeroloop.service.terminal.display import live_screen
-    from aeroloop.service.terminal.keyboard import keyboard
     from aeroloop.service.terminal.monitor import watch
 
-    stop, signals = threading.Event(), list[int]()
-
-    def end(number: int, _: object) -> None:
-        signals.append(number)
-        stop.set()
-
-    with guarded(), keyboard() as read, live_screen() as show:
-        for which in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(which, end)
-        watch(address.network, show, stop, read)
-    if signals:
-        raise typer.Exit(128 + signals[0])
+    with guarded():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
+        watch(address.network)
 
 
 @group.command()
@@ -111,15 +103,44 @@ def show(
     if json:
         typer.echo(record.model_dump_json(indent=2))
     else:
-        from aeroloop.service.terminal.as_commands import as_commands
-
         options = [*(["--config", str(config)] if config else []), *(w for o in overrides or () for w in ("--set", o))]
         typer.echo("\n".join(as_commands(record, options)))
 
 
+def as_commands(record: SessionRecord, options: Sequence[str] = ()) -> list[str]:
+    """`op set-gains`, and `op goto` or `op track`, each with a comment that says where its values come from.
+
+    `options` are appended to each. Points stand in a here-document. A stream's time to reach a set-point has no option.
+    """
+    from aeroloop.protocol.messages.operator import Hold, Points, Sinusoid, Stream
+
+    def numbers(values: Sequence[float]) -> list[str]:
+        return [repr(float(value)).removesuffix(".0") for value in values]
+
+    gains = [word for name, value in record.gains.named.items() for word in (f"--{name}", *numbers(value))]
+    move, table = ["track", "hold"], ""
+    match record.reference:
+        case Hold(attitude=attitude) if attitude is not None:
+            move = ["goto", *numbers(attitude)]
+        case Sinusoid(amplitude=amplitude, frequency=frequency):
+            move = ["track", "sinusoid", "--amplitude", *numbers(amplitude), "--frequency", *numbers(frequency)]
+        case Stream(timeout_s=timeout_s):
+            move = ["track", "stream", "--timeout", *numbers([timeout_s])]
+        case Points(times=times, attitudes=attitudes):
+            move = ["track", "/dev/stdin"]
+            rows = (",".join(numbers([time, *attitude])) for time, attitude in zip(times, attitudes, strict=True))
+            table = "\n".join(["", *rows, "END"])
+    move += ["--in", *numbers([record.within_s or WITHIN_S])]
+    ended = f"; session {record.session} ended: {record.ended}" if record.ended else ""
+    return [
+        f"{join(['aeroloop', 'op', 'set-gains', *gains, *options])}  # {record.gains_from}{ended}",
+        f"{join(['aeroloop', 'op', *move, *options])}{' <<END' if table else ''}  # {record.reference_from}{table}",
+    ]
+
+
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
-    """Arm the plant for the next claim, and let controllers that hold or are faulted claim again."""
+    """Arm the plant for the next claim. Controllers that hold or are faulted claim again."""
     _send(address_of(config, overrides), "arm")
 
 
@@ -129,7 +150,7 @@ def stop(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Stop the configured vehicle's plant at once, or all plants if none is configured: 0 V until `op arm`."""
+    """Stop the vehicle's plant at once: 0 V until `op arm`. All plants if no vehicle is configured."""
     address = address_of(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
@@ -144,7 +165,7 @@ def stop(
 
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
-    """Make the controller release the vehicle and hold until `op arm`, so that another can claim it."""
+    """Make the controller release the vehicle, for another one. It holds until `op arm`."""
     _send(address_of(config, overrides), "stand_down")
 
 
@@ -162,25 +183,21 @@ def inject(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Inject faults into the running emulator, between two ticks; if one is refused, none is injected."""
+    """Inject faults into the running emulator, between two ticks. If one is refused, none is injected."""
     from aeroloop.plant_emulator.faults.language import Fault
     from aeroloop.protocol.messages.operator import Inject
 
     address = address_of(config, overrides)
     if not (faults or clear):
         fail("name a fault, such as rate:off@1..2, or give --clear", 2)
-    try:
-        texts = [str(Fault.parse(text)) for text in faults or ()]
-    except ValueError as error:
-        fail(str(error), 2)
     with checked():
-        message = Inject(faults=texts, clear=clear)
+        message = Inject(faults=[str(Fault.parse(text)) for text in faults or ()], clear=clear)
     _send(address, "inject", message)
 
 
 @group.command("set-gains", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def set_gains(context: typer.Context, config: Config = None, overrides: Overrides = None) -> None:
-    """Change gains of the law between two ticks, each as --NAME and its numbers: --C2 0.2 0.2 0.2; others stay."""
+    """Change gains of the law between two ticks. Each is --NAME and its numbers: --C2 0.2 0.2 0.2; others stay."""
     address = address_of(config, overrides)
     _send(address, "set_gains", gains_from(context.args))
 
@@ -234,7 +251,7 @@ def track(
         str,
         typer.Argument(help="configured, sinusoid, hold, stream, or a CSV file of time (s), roll, pitch, yaw (deg)."),
     ],
-    within_s: Within = 2.0,
+    within_s: Within = WITHIN_S,
     amplitude: Annotated[
         Three | None,
         typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.", show_default=False),
@@ -249,29 +266,22 @@ def track(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Follow another reference: configured, a sinusoid, a file, or set-points; `hold` and `stream` brake at once."""
+    """Follow another reference: a sinusoid, a file, set-points. `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.points_file import read_points
 
     address = address_of(config, overrides)
     given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
     options = {name: value for name, value in given.items() if value is not None}
-    misplaced = set(options) - {"sinusoid": {"amplitude", "frequency"}, "stream": {"timeout_s"}}.get(what, set())
-    if misplaced:
-        fail(f"{what} takes no --{misplaced.pop().removesuffix('_s')}", 2)
-    with checked(Sinusoid, Stream, Track):
-        reference: Reference | None
-        match what:
-            case "configured":
-                reference = None
-            case "sinusoid":
-                reference = Sinusoid.model_validate(options)
-            case "hold":
-                reference = Hold()
-            case "stream":
-                reference = Stream.model_validate(options)
-            case _:
-                reference = read_points(Path(what))
+    kinds: dict[str, type[Message]] = {"sinusoid": Sinusoid, "hold": Hold, "stream": Stream}
+    if options and what not in kinds:
+        fail(f"{what} takes no option but --in", 2)
+    with checked(*kinds.values(), Track):
+        reference: Reference | None = None
+        if kind := kinds.get(what):
+            reference = cast("Reference", kind.model_validate(options))
+        elif what != "configured":
+            reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
     _send(address, "track", message)
 

@@ -15,13 +15,13 @@ from aeroloop.service.cli.common import (
     BitsIn,
     BitsOut,
     Config,
-    DaemonOptions,
     Duration,
     Json,
+    LogFormat,
     NewLog,
     Overrides,
-    daemon,
     guarded,
+    log_as,
     loop_of,
     run_alone,
     run_role,
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.protocol.runtime.node import Node
+    from aeroloop.service.config import Settings
 
 Faults = Annotated[
     list[str] | None,
@@ -64,7 +65,7 @@ def demo(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run the paper's experiment over Zenoh in three processes, and review its log."""
+    """Run the paper's experiment in three processes over Zenoh. Then review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
     settings = with_bits_of(loop_of(config, overrides, *options), bits_out, bits_in)
     from aeroloop.service.lab.demo import run_demo
@@ -77,7 +78,7 @@ def demo(
             typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
             figures, complete = run_demo(settings, duration, log)
         else:
-            with live_demo(duration) as update:
+            with live_demo(settings, duration) as update:
                 figures, complete = run_demo(settings, duration, log, update)
     show(figures, json, demo_account)
     if not json:
@@ -88,20 +89,22 @@ def demo(
 
 
 @group.command()
-@daemon("controller")
 def controller(
-    options: DaemonOptions,
     duration: Annotated[
         float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.", show_default=False)
     ] = None,
     auto_arm: Annotated[
         bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
     ] = False,
+    log_format: LogFormat = "text",
+    config: Config = None,
+    overrides: Overrides = None,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
+    log_as("controller", log_format)
     words = [f"controller.duration_s={duration}"] if duration is not None else []
     words += ["controller.auto_arm=true"] if auto_arm else []
-    settings = loop_of(options.config, options.overrides, *words)
+    settings = loop_of(config, overrides, *words)
 
     def run(role: Node) -> None:
         from aeroloop.service.control.laws.registry import version_of
@@ -113,35 +116,41 @@ def controller(
         role.publish_description(settings.description(), described_certificate(settings))
         daemon.run()
 
-    run_role("controller", settings, run, options)
+    run_role("controller", settings, run)
 
 
 @group.command()
-@daemon("plant")
-def emulator(options: DaemonOptions, faults: Faults = None) -> None:
+def emulator(
+    faults: Faults = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
+) -> None:
     """Run the emulated plant until SIGTERM."""
-    _run_plant(options, "plant.via=emulator", *_fault_options(faults))
+    log_as("plant", log_format)
+    _run_plant(settings_of(config, overrides, "plant.via=emulator", *_fault_options(faults)))
 
 
 @group.command()
-@daemon("plant")
-def plant(options: DaemonOptions) -> None:
-    """Run the plant end that `plant.via` names until SIGTERM: emulator, CAN bridge or Quanser's board."""
-    _run_plant(options)
+def plant(log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None) -> None:
+    """Run the plant end that `plant.via` names until SIGTERM. It is the emulator, a CAN bridge or Quanser's board."""
+    log_as("plant", log_format)
+    _run_plant(settings_of(config, overrides))
 
 
-@group.command()
-@daemon("plant")
-def bridge(options: DaemonOptions) -> None:
-    """Run the bridge to a plant on the configured CAN bus until SIGTERM."""
-    _run_plant(options, "plant.via=can")
+def _run_plant(settings: Settings) -> None:
+    def run(role: Node) -> None:
+        from aeroloop.service.daemon.roles import run_plant
+
+        run_plant(role, settings)
+
+    run_role("plant", settings, run)
 
 
 @group.command("can-node")
-@daemon("node")
-def can_node(options: DaemonOptions, faults: Faults = None) -> None:
-    """Run the emulated plant as a node on the configured CAN bus until SIGTERM."""
-    settings = settings_of(options.config, options.overrides, *_fault_options(faults))
+def can_node(
+    faults: Faults = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
+) -> None:
+    """Run the emulated plant as a node on the CAN bus."""
+    log_as("node", log_format)
+    settings = settings_of(config, overrides, *_fault_options(faults))
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
@@ -150,34 +159,25 @@ def can_node(options: DaemonOptions, faults: Faults = None) -> None:
         emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
         emulator.run(CanNetwork(settings.can, settings.loop, emulator.endpoint))
 
-    run_alone(run, options)
+    run_alone(run)
 
 
 def _fault_options(faults: list[str] | None) -> list[str]:
     return [f"plant.faults={dumps(faults)}"] if faults else []
 
 
-def _run_plant(options: DaemonOptions, *overrides: str) -> None:
-    settings = settings_of(options.config, options.overrides, *overrides)
-
-    def run(role: Node) -> None:
-        from aeroloop.service.daemon.roles import run_plant
-
-        run_plant(role, settings)
-
-    run_role("plant", settings, run, options)
-
-
 @group.command()
-@daemon("router")
 def router(
-    options: DaemonOptions,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the configuration for a stock zenohd, JSON5, and end.")
     ] = False,
+    log_format: LogFormat = "text",
+    config: Config = None,
+    overrides: Overrides = None,
 ) -> None:
-    """Run a router for clients (network.mode = "client") until SIGTERM."""
-    settings = settings_of(options.config, options.overrides)
+    """Run a router for clients until SIGTERM, which have network.mode = "client"."""
+    log_as("router", log_format)
+    settings = settings_of(config, overrides)
     if print_config:
         from aeroloop.protocol.transport.network import zenohd_config
         from aeroloop.protocol.transport.network_settings import Identity
@@ -188,22 +188,21 @@ def router(
 
     from aeroloop.service.daemon.roles import run_router
 
-    run_role("router", settings, run_router, options)
+    run_role("router", settings, run_router)
 
 
 @group.command()
-@daemon("recorder")
 def recorder(
-    options: DaemonOptions,
-    log: Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)] = None,
+    log: NewLog = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
 ) -> None:
-    """Record the traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
+    """Record every vehicle on the network into a log until SIGTERM."""
+    log_as("recorder", log_format)
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
-    settings = settings_of(options.config, options.overrides, *words)
+    settings = settings_of(config, overrides, *words)
 
     def run(role: Node) -> None:
         from aeroloop.service.recording.recorder import Recorder
 
         Recorder(role, settings.recorder).run()
 
-    run_role("recorder", settings, run, options)
+    run_role("recorder", settings, run)

@@ -20,7 +20,7 @@ def show_config(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print the effective configuration as TOML, each key with what it means, its unit and its bounds."""
+    """Print the configuration as TOML, with comments. Each key has what it means, its unit and its bounds."""
     from aeroloop.protocol.plugins import PluginError
     from aeroloop.service.config import with_law_settings
 
@@ -33,8 +33,8 @@ def show_config(
 @group.command()
 def spec(config: Config = None, overrides: Overrides = None) -> None:
     """Print the configured wire: frames, widths and quantizer steps."""
+    from aeroloop.service.terminal.sheets import wire_sheets
     from aeroloop.service.terminal.show import show_all
-    from aeroloop.service.terminal.wire_table import wire_sheets
 
     show_all(wire_sheets(settings_of(config, overrides).wire))
 
@@ -52,17 +52,11 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
-def layout(
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle to show; the configured one if left out.")
-    ] = None,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
-    """Print a layout file for Foxglove or Lichtblick that shows a log or `log live`."""
-    settings = settings_of(config, overrides, *([f'vehicle="{vehicle}"'] if vehicle is not None else []))
+def layout(config: Config = None, overrides: Overrides = None) -> None:
+    """Print a layout for Foxglove or Lichtblick. It shows a log or `log live`."""
+    settings = settings_of(config, overrides)
 
-    from aeroloop.service.viewers.layout import layout as describe
+    from aeroloop.service.viewers.schemas import layout as describe
 
     typer.echo(describe(settings.vehicle, settings.wire.motors))
 

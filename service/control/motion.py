@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from aeroloop.protocol.messages.operator import MAX_WITHIN_S, Change, Hold, Reference
-from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled
 from aeroloop.service.control.reference import (
     SAMPLES,
@@ -162,7 +162,7 @@ def _backwards(state: Angles) -> Angles:
 
 
 def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
-    """The shortest approach to a target within the limits. Raises FollowError if there is none."""
+    """The shortest approach to a target within the limits, from a state. Raises FollowError if there is none."""
     there = _backwards(target.first)
     brake_s, run_up_s = braking_times(here, limits), braking_times(there, limits)
     still_s = float(brake_s.max()) + float(run_up_s.max())
@@ -182,8 +182,13 @@ def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
             f"{degrees(limits.tilt):g}°, however long it takes: go there in smaller steps"
         )
     if not still_s:
-        return Approach(within_s)  # from rest to rest it is a single quintic
-    return Approach(within_s, brake_s=tuple(brake_s.tolist()), run_up_s=tuple(run_up_s.tolist()))
+        return Approach(within_s, here=here.row)  # from rest to rest it is a single quintic
+    return Approach(within_s, None, tuple(brake_s.tolist()), tuple(run_up_s.tolist()), here.row)
+
+
+def shortest_from_rest(target: Plan, start: Vector, limits: Limits) -> Approach:
+    """The shortest approach from roll, pitch, yaw at which a body is found [deg]. Raises FollowError."""
+    return shortest(target, at_rest(np.radians(np.array([start]))), limits)._replace(start=start, here=None)
 
 
 def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) -> Approach:
@@ -203,7 +208,7 @@ def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) ->
             break  # a slower one would swing further
         fastest = float(way.speeds().max())
         if fastest <= limits.rate:
-            return Approach(candidate)
+            return Approach(candidate, here=here.row)
         candidate *= _SLOWER * fastest / limits.rate
     return shortest(target, here, limits).at_least(within_s)
 
@@ -276,29 +281,12 @@ class Motion:
             approach = Approach(*(getattr(change, name) for name in Approach._fields))
             self.follow(Plan.of(change.reference), change.tick * period, approach)
 
-    def attitude(self, t: float) -> Quaternion:
-        """q_d at time t [s]."""
-        w, x, y, z = self.at(t)[0]
-        return w, x, y, z
-
     def rest(self, t: float, limits: Limits) -> Hold:
         """The attitude reached by braking from time t [s] on."""
         here = self.here(t)
         brake_s = braking_times(here, limits)
         roll, pitch, yaw = np.degrees(braked(here, brake_s, np.array([brake_s.max()])).angle[0]).tolist()
         return Hold(attitude=(roll, pitch, yaw))
-
-    def shortest(self, target: Plan, t: float, limits: Limits, start: Vector | None = None) -> Approach:
-        """The shortest approach from time t [s] on, from `start`, if given, at rest [deg]; as the function does."""
-        if start is not None:
-            return shortest(target, at_rest(np.radians(np.array([start]))), limits)._replace(start=start)
-        here = self.here(t)
-        return shortest(target, here, limits)._replace(here=here.row)
-
-    def to_set_point(self, target: Plan, t: float, within_s: float, limits: Limits) -> Approach:
-        """The approach to a set-point from time t [s] on; as the function does."""
-        here = self.here(t)
-        return to_set_point(target, here, within_s, limits)._replace(here=here.row)
 
     def here(self, t: float) -> Angles:
         """Roll, pitch, yaw, their rates and accelerations at time t [s]. Shapes (1, 3)."""

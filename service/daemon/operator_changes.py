@@ -35,12 +35,11 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, distance, to_euler
+from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
-from aeroloop.service.control.motion import Approach, nearest_turn
+from aeroloop.service.control.motion import Approach, nearest_turn, shortest, shortest_from_rest, to_set_point
 from aeroloop.service.control.reference import FollowError, Limits, Plan
-from aeroloop.service.settings import ControllerSettings
 
 START_S: Final = 1.0
 """Least time to reach a reference that no operator gave a time for, at a session's start [s]."""
@@ -54,10 +53,7 @@ class OperatorChanges:
     """Gains and reference of one controller, and their changes.
 
     Args:
-        law, reference: As configured.
-        settings: Limits of references, and what a session begins with.
         trace: Where changes are recorded.
-        rolls: Whether the vehicle can roll.
         why_none: Says why no session runs and what to do, where none does.
 
     Attributes:
@@ -66,29 +62,19 @@ class OperatorChanges:
         setpoints: What an operator streams.
     """
 
-    def __init__(
-        self,
-        role: Node,
-        law: LawSettings,
-        reference: Reference,
-        settings: ControllerSettings,
-        trace: TraceWriter,
-        *,
-        rolls: bool,
-        why_none: Callable[[], str],
-    ) -> None:
+    def __init__(self, role: Node, settings: Settings, trace: TraceWriter, why_none: Callable[[], str]) -> None:
+        law, own = settings.law, settings.controller
         self._role = role
         self._law = law
-        self._configured = reference
-        self._settings = settings
+        self._configured = reference = settings.reference
+        self._settings = own
         self._trace = trace
-        self._rolls = rolls
         self._why_none = why_none
         self._limits = Limits(
-            rate=settings.max_reference_rate,
-            braking=settings.max_reference_braking,
-            tilt=radians(settings.max_reference_tilt_deg),
-            rolls=rolls,
+            rate=own.max_reference_rate,
+            braking=own.max_reference_braking,
+            tilt=radians(own.max_reference_tilt_deg),
+            rolls=settings.wire.actuators > 2,
         )
         self.setpoints = SetpointStream(role)
         self._controller: Controller | None = None
@@ -106,7 +92,7 @@ class OperatorChanges:
             within_s=0.0,
             since_tick=0,
         )
-        if settings.after_restart != "configured":
+        if own.after_restart != "configured":
             self._begin_with(Hold(), "held")
 
     # ── requests: checked in their topic's thread, applied between two ticks ──
@@ -153,9 +139,9 @@ class OperatorChanges:
         if isinstance(reference, Stream) or reference == Hold():
             held = motion.rest(t, self._limits)
             plan = Plan.of(held)
-            approach = motion.shortest(plan, t, self._limits).at_least(START_S)
+            approach = shortest(plan, motion.here(t), self._limits).at_least(START_S)
         else:
-            approach = motion.shortest(plan, t, self._limits).lasting(within_s, self._limits)
+            approach = shortest(plan, motion.here(t), self._limits).lasting(within_s, self._limits)
         self.setpoints.begin()
         self._follow(held, plan, approach)
         stream = reference if isinstance(reference, Stream) else held
@@ -223,18 +209,19 @@ class OperatorChanges:
         if attitude is None:
             return
         self._started_near = True
-        start, t, target = hold_here(attitude, rolls=self._rolls), self._time, self._present_reference
+        start, t, target = hold_here(attitude, rolls=self._limits.rolls), self._time, self._present_reference
         if self.record.reference_from != "configured" and target == Hold():
             target, approach = Hold(attitude=start), Approach(start=start)
             plan = Plan.of(target)
             text = f"holds the attitude found, {in_words(target)}; `aeroloop op track configured` moves it"
         else:
-            away = degrees(distance(attitude, controller.motion.attitude(t)))
+            w, x, y, z = controller.motion.at(t)[0]
+            away = degrees(distance(attitude, (w, x, y, z)))
             if self._settings.after_restart == "configured" and away <= self._settings.start_within_deg:
                 return
             plan = Plan.of(target)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
-            approach = controller.motion.shortest(plan, t, limits, nearest_turn(start, plan))
+            approach = shortest_from_rest(plan, nearest_turn(start, plan), limits)
             approach = approach.at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
         self._follow(target, plan, approach)
@@ -264,7 +251,8 @@ class OperatorChanges:
             return
         hold, plan = newest
         try:
-            approach = self._running().motion.to_set_point(plan, self._time, stream.within_s, self._limits)
+            here = self._running().motion.here(self._time)
+            approach = to_set_point(plan, here, stream.within_s, self._limits)
         except FollowError as error:
             self.setpoints.refuse(error, self.record.session)
             return

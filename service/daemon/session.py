@@ -62,22 +62,14 @@ class Shared:
     """
 
     def __init__(self, role: Node, settings: Settings, why_none: Callable[[], str]) -> None:
-        loop, wire, law = settings.loop, settings.wire, settings.law
+        loop, wire = settings.loop, settings.wire
         self.claims = ClaimClient(role, loop, wire, auto_arm=settings.controller.auto_arm)
         self.machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self.cause = ""
         self.trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
-        self.changes = OperatorChanges(
-            role,
-            law,
-            settings.reference,
-            settings.controller,
-            self.trace,
-            rolls=wire.actuators > 2,
-            why_none=why_none,
-        )
+        self.changes = OperatorChanges(role, settings, self.trace, why_none)
         self.plant = PlantStatus(role)
-        self.watch = LawWatch(role, f"law {law.kind}")
+        self.watch = LawWatch(role, f"law {settings.law.kind}")
         self.timing = None if loop.lockstep else LoopTiming(clock=role.clock)
         self.age = RollingHistogram(role.clock)
         self.counts = Counts()

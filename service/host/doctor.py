@@ -142,42 +142,45 @@ def refused(network: NetworkSettings) -> list[Finding]:
     ] or [Finding(what="network", good=True, found=f"none of {len(found)} certificates is refused")]
 
 
-def _settings() -> list[Finding]:
+def _settings() -> Iterator[Finding]:
     """The kernel's settings and this process's limits."""
     root = os.geteuid() == 0
     priority, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     memory, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     unlimited = memory == resource.RLIM_INFINITY
     clock, runtime, governor = map(host_facts().get, ("clock", "realtime_throttling_us", "governor"))
-    return [
-        Finding(
-            what="clock source",
-            good=clock in GOOD_CLOCKS,
-            found=clock or "not reported by this kernel",
-            advice="reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
+    throttled = "off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported"
+    memory_found = "root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB"
+    for what, good, found, advice in (
+        (
+            "clock source",
+            clock in GOOD_CLOCKS,
+            clock or "not reported by this kernel",
+            "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
         ),
-        Finding(
-            what="real-time priority",
-            good=root or priority != 0,
-            found="root may" if root else f"limit {priority}",
-            advice="give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
+        (
+            "real-time priority",
+            root or priority != 0,
+            "root may" if root else f"limit {priority}",
+            "give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
         ),
-        Finding(
-            what="locked memory",
-            good=root or unlimited,
-            found="root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB",
-            advice="give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
+        (
+            "locked memory",
+            root or unlimited,
+            memory_found,
+            "give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
         ),
-        Finding(
-            what="real-time throttling",
-            good=runtime is not None,
-            found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported",
-            advice="the kernel does not report how much time real-time tasks may take",
+        (
+            "real-time throttling",
+            runtime is not None,
+            throttled,
+            "the kernel does not report how much time real-time tasks may take",
         ),
-        Finding(
-            what="CPU frequency",
-            good=governor in (None, "performance"),
-            found=governor or "not scaled by this kernel",
-            advice="set the governor to performance: cpupower frequency-set -g performance",
+        (
+            "CPU frequency",
+            governor in (None, "performance"),
+            governor or "not scaled by this kernel",
+            "set the governor to performance: cpupower frequency-set -g performance",
         ),
-    ]
+    ):
+        yield Finding(what=what, good=good, found=found, advice=advice)

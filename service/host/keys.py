@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Final, cast
 from uuid import uuid4
@@ -44,21 +45,11 @@ KEY: Final = "ca.key"
 DAYS: Final = 90
 """Lifetime of a certificate. Why so short: Zenoh has no revocation lists, so a stolen key is good until it expires."""
 AUTHORITY_DAYS: Final = 3650
+EXPIRED: Final = "{} has expired: make a new authority in another directory"
 _EARLIER: Final = timedelta(hours=1)
 """A certificate is valid from so long before it is issued: hosts' clocks differ."""
 _LONGEST: Final = 64
 """Characters of a name in a certificate, by RFC 5280."""
-_USES: Final = (
-    "digital_signature",
-    "content_commitment",
-    "key_encipherment",
-    "data_encipherment",
-    "key_agreement",
-    "key_cert_sign",
-    "crl_sign",
-    "encipher_only",
-    "decipher_only",
-)
 
 
 class KeyFile(BaseModel, frozen=True):
@@ -77,17 +68,21 @@ class KeyFile(BaseModel, frozen=True):
 def init(directory: Path, days: int = AUTHORITY_DAYS) -> Path:
     """Make a private authority, `ca.pem` and `ca.key`, in a new or existing directory. Returns `ca.pem`.
 
+    It has a name of its own: an authority that replaces another must not be taken for it.
+
     Raises:
         CertificateError: There is one, or the directory cannot be written.
     """
-    certificate, secret = directory / AUTHORITY, directory / KEY
-    _make(directory)
-    _refuse_existing(certificate, secret)
-    key = generate_private_key(SECP256R1())
-    made = _new_authority(key, days)
-    _write(secret, _pem(key))
-    _write(certificate, _pem(made), 0o644)
-    return certificate
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if directory.stat().st_mode & 0o077:
+            raise CertificateError(f"{directory} can be entered by others: `chmod 700 {directory}`, or name another")
+    except OSError as error:
+        raise CertificateError(f"cannot make {directory}: {error.strerror}") from None
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"aeroloop authority {uuid4().hex[:8]}")])
+    key, until = generate_private_key(SECP256R1()), datetime.now(UTC) + timedelta(days=days)
+    made = _signed(key, name, name, key.public_key(), until, authority=True)
+    return _write_pair(directory / AUTHORITY, directory / KEY, made, key)
 
 
 def issue(directory: Path, role: str, name: str, vehicle: str | None = None, days: int = DAYS) -> Path:
@@ -98,18 +93,22 @@ def issue(directory: Path, role: str, name: str, vehicle: str | None = None, day
         role: One of `ROLES`.
         name: Host or person that gets it.
         vehicle: Its vehicle; None is every one.
-        days: How long it is valid.
+        days: How long it is valid; it ends with the authority's at the latest.
 
     Raises:
         CertificateError: Role, name or vehicle will not do; a file exists; the authority's key is not here.
     """
-    whose, file = _subject(role, name, vehicle), file_of(directory, role, vehicle)
+    subject, file = _subject(role, name, vehicle), file_of(directory, role, vehicle)
     _refuse_existing(file, file.with_suffix(".key"))
-    key = generate_private_key(SECP256R1())
-    made = _sign(directory, whose, key.public_key(), days)
-    _write(file.with_suffix(".key"), _pem(key))
-    _write(file, _pem(made), 0o644)
-    return file
+    secret, authority = _read_key(directory / KEY), load(directory / AUTHORITY)
+    if authority.public_key() != secret.public_key():
+        raise CertificateError(f"{directory / KEY} is not the key of {AUTHORITY} beside it")
+    now = datetime.now(UTC)
+    if authority.not_valid_after_utc <= now:
+        raise CertificateError(EXPIRED.format(directory / AUTHORITY))
+    key, until = generate_private_key(SECP256R1()), min(now + timedelta(days=days), authority.not_valid_after_utc)
+    made = _signed(secret, authority.subject, subject, key.public_key(), until)
+    return _write_pair(file, file.with_suffix(".key"), made, key)
 
 
 def show(directory: Path) -> list[KeyFile]:
@@ -120,45 +119,37 @@ def show(directory: Path) -> list[KeyFile]:
     """
     ca = load(directory / AUTHORITY)
     days_left = (ca.not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86400
-    first = KeyFile(
+    authority = KeyFile(
         file=AUTHORITY,
         role="authority",
         name=subject_field(ca, "CN"),
         valid_until=ca.not_valid_after_utc,
         days_left=days_left,
         fingerprint=ca.fingerprint(SHA256()).hex(),
-        problem=f"{directory / AUTHORITY} has expired: make a new authority in another directory"
-        if days_left < 0
-        else None,
+        problem=EXPIRED.format(directory / AUTHORITY) if days_left < 0 else None,
     )
-    return [first, *map(_shown, _certificates(directory))]
+    named = (file for file in sorted(directory.glob("*.pem")) if file.stem.partition(".")[0] in ROLES)
+    return [authority, *map(_shown, named)]
 
 
 def _shown(file: Path) -> KeyFile:
+    row = KeyFile(file=file.name)
     try:
         found = read_certificate(file)
-    except CertificateError as error:
-        return KeyFile(file=file.name, problem=str(error))
-    row = KeyFile(
-        file=file.name,
-        role=found.role,
-        vehicle=found.vehicle,
-        name=found.name,
-        valid_until=found.not_after,
-        days_left=found.days_left,
-        fingerprint=found.x509.fingerprint(SHA256()).hex(),
-    )
-    role, _, vehicle = file.stem.partition(".")
-    try:
+        row = KeyFile(
+            file=file.name,
+            role=found.role,
+            vehicle=found.vehicle,
+            name=found.name,
+            valid_until=found.not_after,
+            days_left=found.days_left,
+            fingerprint=found.x509.fingerprint(SHA256()).hex(),
+        )
+        role, _, vehicle = file.stem.partition(".")
         check(file, role, vehicle or None)
     except CertificateError as error:
         return row.model_copy(update={"problem": str(error)})
     return row
-
-
-def _certificates(directory: Path) -> Iterator[Path]:
-    """The files of a directory that are named as roles' certificates."""
-    return (file for file in sorted(directory.glob("*.pem")) if file.stem.partition(".")[0] in ROLES)
 
 
 def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
@@ -173,57 +164,37 @@ def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
         raise CertificateError(f"{cn} is too long for a certificate: {_LONGEST} characters at most")
     if not (name.isprintable() and 0 < len(name) <= _LONGEST):
         raise CertificateError(f"NAME is a host or a person, in 1 to {_LONGEST} printable characters")
-    return x509.Name(
-        [x509.NameAttribute(NameOID.COMMON_NAME, cn), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, name)]
-    )
-
-
-def _new_authority(key: EllipticCurvePrivateKey, days: int) -> x509.Certificate:
-    """An authority under a name of its own: one that replaces another must not be taken for it."""
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"aeroloop authority {uuid4().hex[:8]}")])
-    until = datetime.now(UTC) + timedelta(days=days)
-    return _signed(key, name, name, key.public_key(), until, authority=True)
-
-
-def _sign(directory: Path, whose: x509.Name, public: EllipticCurvePublicKey, days: int) -> x509.Certificate:
-    """A certificate for a key, of the authority in a directory; it ends with the authority's at the latest."""
-    secret = directory / KEY
-    if not secret.exists():
-        raise CertificateError(f"{secret} is not here: it stays where `aeroloop host keys init` made it; issue there")
-    key, authority = _read_key(secret), load(directory / AUTHORITY)
-    if authority.public_key() != key.public_key():
-        raise CertificateError(f"{secret} is not the key of {AUTHORITY} beside it")
-    now = datetime.now(UTC)
-    if authority.not_valid_after_utc <= now:
-        raise CertificateError(f"{directory / AUTHORITY} has expired: make a new authority in another directory")
-    until = min(now + timedelta(days=days), authority.not_valid_after_utc)
-    return _signed(key, authority.subject, whose, public, until)
+    fields = {NameOID.COMMON_NAME: cn, NameOID.ORGANIZATIONAL_UNIT_NAME: name}
+    return x509.Name([x509.NameAttribute(field, text) for field, text in fields.items()])
 
 
 def _signed(
-    key: EllipticCurvePrivateKey,
+    secret: EllipticCurvePrivateKey,
     issuer: x509.Name,
-    whose: x509.Name,
+    subject: x509.Name,
     public: EllipticCurvePublicKey,
     until: datetime,
     *,
     authority: bool = False,
 ) -> x509.Certificate:
+    uses = dict.fromkeys(signature(x509.KeyUsage).parameters, False)
+    uses["key_cert_sign" if authority else "digital_signature"] = True
     begin = datetime.now(UTC) - _EARLIER
-    uses = dict.fromkeys(_USES, False) | {"key_cert_sign" if authority else "digital_signature": True}
-    both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # a peer connects and listens
     builder = (
-        x509.CertificateBuilder(issuer, whose, public, x509.random_serial_number(), begin, until)
+        x509.CertificateBuilder(issuer, subject, public, x509.random_serial_number(), begin, until)
         .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
         .add_extension(x509.KeyUsage(**uses), critical=True)
     )
-    if not authority:
+    if not authority:  # a peer connects and listens
+        both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = builder.add_extension(x509.ExtendedKeyUsage(both), critical=False)
-    return builder.sign(key, SHA256())
+    return builder.sign(secret, SHA256())
 
 
 def _read_key(file: Path) -> EllipticCurvePrivateKey:
-    """Read a private key. Raises CertificateError."""
+    """Read the authority's private key. Raises CertificateError."""
+    if not file.exists():
+        raise CertificateError(f"{file} is not here: it stays where `aeroloop host keys init` made it; issue there")
     try:
         return cast(EllipticCurvePrivateKey, load_pem_private_key(file.read_bytes(), None))
     except OSError as error:
@@ -232,39 +203,29 @@ def _read_key(file: Path) -> EllipticCurvePrivateKey:
         raise CertificateError(f"{file} is no private key in PEM without a password") from None
 
 
-def _pem(made: x509.Certificate | EllipticCurvePrivateKey) -> bytes:
-    if isinstance(made, EllipticCurvePrivateKey):
-        return made.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    return made.public_bytes(Encoding.PEM)
-
-
-def _make(directory: Path) -> None:
-    try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if directory.stat().st_mode & 0o077:
-            raise CertificateError(f"{directory} can be entered by others: `chmod 700 {directory}`, or name another")
-    except OSError as error:
-        raise CertificateError(f"cannot make {directory}: {error.strerror}") from None
-
-
 def _refuse_existing(*files: Path) -> None:
     for file in files:
         if os.path.lexists(file):
             raise CertificateError(f"{file} exists, and is not overwritten: move it away first")
 
 
-def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
-    """Write a new file; complete or absent, of this mode from its first byte on."""
-    try:
-        number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    except OSError as error:
-        _refuse_existing(file)
-        raise CertificateError(f"cannot write {file}: {error.strerror}") from None
-    try:
-        with os.fdopen(number, "wb") as out:
-            out.write(content)
-            out.flush()
-            os.fsync(number)
-    except BaseException:
-        file.unlink()
-        raise
+def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticCurvePrivateKey) -> Path:
+    """Write a certificate and its key as new files: complete or absent, and of their mode from the first byte on."""
+    _refuse_existing(file, secret)
+    contents = {
+        secret: (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600),
+        file: (made.public_bytes(Encoding.PEM), 0o644),
+    }
+    for path, (content, mode) in contents.items():
+        try:
+            with open(path, "xb", opener=partial(os.open, mode=mode)) as out:
+                try:
+                    out.write(content)
+                    out.flush()
+                    os.fsync(out.fileno())
+                except OSError:
+                    path.unlink()
+                    raise
+        except OSError as error:
+            raise CertificateError(f"cannot write {path}: {error.strerror}") from None
+    return file

@@ -1,4 +1,4 @@
-"""Axes of a sweep: `--vary` as text, and every combination of its values as a configuration.
+"""Axes of a sweep: `--vary` as text, and every combination of its values as a configuration with a name.
 
 Values are given as `--set` takes them, so an error in one reads as any error of the configuration. All combinations are
 checked before the first experiment runs.
@@ -11,12 +11,10 @@ import re
 import tomllib
 from collections.abc import Sequence
 from fractions import Fraction
-from functools import lru_cache
 from hashlib import sha256
 from inspect import getfile
 from itertools import product
 from math import prod
-from os import stat
 from os.path import expanduser, isfile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -29,7 +27,6 @@ LIMIT: Final = 10_000_000
 """Experiments of a sweep, at most: what fits into memory."""
 SECTIONS: Final = ("law", "loop", "plant", "reference", "wire")
 """Sections of the configuration that an experiment depends on."""
-_SEEDS: Final = ("plant.wind.seed", "plant.sensors.seed")
 _NUMBER: Final = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,2})?"
 _RANGE: Final = re.compile(rf"({_NUMBER})\.\.({_NUMBER})\*(\d+)")
 
@@ -55,15 +52,16 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     Raises:
         ConfigError: Neither of them, no value, or a key that stands twice or that no experiment depends on.
     """
-    axes = [_axis(text) for text in texts]
-    for i, axis in enumerate(axes):
-        if axis.key in (other.key for other in axes[:i]):
+    axes = dict[str, Axis]()
+    for axis in map(_axis, texts):
+        if axis.key in axes:
             raise ConfigError(f"--vary gives {axis.key} twice: put all its values into one")
-        if axis.key in _SEEDS:
+        if axis.key in ("plant.wind.seed", "plant.sensors.seed"):
             raise ConfigError(f"--vary {axis.key}: --seeds sets it")
         if axis.key.partition(".")[0] not in SECTIONS:
             raise ConfigError(f"--vary {axis.key}: an experiment depends on {', '.join(SECTIONS)} only")
-    return axes
+        axes[axis.key] = axis
+    return list(axes.values())
 
 
 def _axis(text: str) -> Axis:
@@ -107,16 +105,20 @@ def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duratio
     for values in product(*(axis.values for axis in axes)):
         overrides = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
         description = load_over(settings, overrides).description()
-        columns = tuple(_column(description, *pair) for pair in zip(axes, values, strict=True))
+        columns = tuple(_column(description, axis.key, given) for axis, given in zip(axes, values, strict=True))
         digest = digest_of(description, duration_s)
         if digest in found:
-            raise ConfigError(f"--vary gives the same twice: {_words(found[digest].overrides)} and {_words(overrides)}")
+            first, second = (" ".join(each) or "the configuration" for each in (found[digest].overrides, overrides))
+            raise ConfigError(f"--vary gives the same twice: {first} and {second}")
         found[digest] = Configuration(overrides, columns, digest)
     return list(found.values())
 
 
-def _words(overrides: Sequence[str]) -> str:
-    return " ".join(overrides) or "the configuration"
+def _column(description: Any, key: str, given: str) -> Any:
+    value = description
+    for name in key.split("."):
+        value = value[name] if isinstance(value, dict) else None
+    return given if isinstance(value, dict | list) else value
 
 
 def digest_of(description: dict[str, Any], duration_s: float) -> str:
@@ -127,29 +129,13 @@ def digest_of(description: dict[str, Any], duration_s: float) -> str:
     """
     parts: dict[str, Any] = {name: description[name] for name in SECTIONS}
     law, plant = OwnLawSettings.model_validate(description["law"]), description["plant"]
+    files = list[str]()
     if law.kind not in BUILT_IN:
-        parts["law_file"] = _file_digest(getfile(law_class(law)))
+        files.append(getfile(law_class(law)))
     if plant["kind"] not in EMULATED:
         named = (value for value in plant["own"].values() if isinstance(value, str | Path))
-        files = [getfile(class_of(plant["kind"])), *filter(isfile, map(expanduser, named))]
-        parts["plant_files"] = [_file_digest(file) for file in files]
+        files += [getfile(class_of(plant["kind"])), *filter(isfile, map(expanduser, named))]
+    parts["files"] = [sha256(Path(file).read_bytes()).hexdigest() for file in files]
     parts["plant"] = plant | {name: {**plant[name], "seed": None} for name in ("wind", "sensors")}
     canonical = json.dumps({**parts, "duration_s": duration_s}, sort_keys=True, separators=(",", ":"))
     return sha256(canonical.encode()).hexdigest()
-
-
-def _file_digest(path: str) -> str:
-    found = stat(path)
-    return _digest_when(path, found.st_mtime_ns, found.st_size)
-
-
-@lru_cache(maxsize=64)
-def _digest_when(path: str, _changed: int, _size: int) -> str:
-    return sha256(Path(path).read_bytes()).hexdigest()
-
-
-def _column(description: Any, axis: Axis, given: str) -> Any:
-    value = description
-    for name in axis.key.split("."):
-        value = value[name] if isinstance(value, dict) else None
-    return given if isinstance(value, dict | list) else value

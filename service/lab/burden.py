@@ -1,4 +1,4 @@
-"""Burden of a loop: error against bits over a grid of bits, quantizers, transmit policies and sensors.
+"""`lab burden`: error against bits over a grid of bits, quantizers, transmit policies and sensors.
 
 Each cell is one lockstep experiment. Both policies give the same run to the last bit, because an end that receives no
 frame holds its last levels; so a cell runs once, and its codes give the traffic of both. Every figure is compared with
@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, Final, NamedTuple, get_args
+from math import log10
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -28,10 +30,13 @@ from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Policy, Transmit
 from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
-from aeroloop.service.figures import Floats, Integers, StreamFigures
+from aeroloop.service.figures import Floats, Integers
 from aeroloop.service.lab.experiment import LoopEndedError, experiment, heartbeat_of, sent_ticks
-from aeroloop.service.lab.sweep import Progress, Row, Sheets
-from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
+from aeroloop.service.lab.sweep import PROCESSES, Progress, Row, Sheets, open_workers, run_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 # ── the grid ──
 
@@ -44,10 +49,11 @@ QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
     "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
 }
 """Kinds for ε, ω and u, by the name of the choice."""
+POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 
-class BurdenError(AeroloopError):
-    """The grid cannot be run; one line with the reason."""
+class GridError(AeroloopError):
+    """The cells cannot be run or compared; one line with the reason."""
 
 
 class SensorChoice(NamedTuple):
@@ -99,13 +105,13 @@ def grid(
         sensors: Names out of SENSORS.
 
     Raises:
-        BurdenError: An unknown name, or a cell that the configuration does not allow.
+        GridError: An unknown name, or a cell that the configuration does not allow.
     """
     if settings.plant.ideal:
-        raise BurdenError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
-    pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
-    kinds = _chosen("--quantizer", quantizers, QUANTIZERS)
-    levels = _chosen("--sensors", sensors, SENSORS)
+        raise GridError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
+    pairs = [pair for pair in dict.fromkeys(bits_pair(text) for text in bits or BITS) if pair != FLOAT64]
+    kinds = chosen("--quantizer", quantizers, QUANTIZERS)
+    levels = chosen("--sensors", sensors, SENSORS)
     choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
     cells = [BurdenCell(*pair, kind, level) for level in levels for pair, kind in choices]
     for cell in cells:
@@ -117,16 +123,17 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
     """The configuration of a cell, sending at every tick.
 
     Raises:
-        BurdenError: The bits are too few for the quantizer, or the plant has no such sensors.
+        GridError: The bits are too few for the quantizer, or the plant has no such sensors.
     """
     wire, plant = settings.wire, settings.plant
-    out, inp = cell.bits_out, cell.bits_in
-    attitude, rate, voltage = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
+    kinds = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
+    signals = {"attitude": cell.bits_out, "rate": cell.bits_out, "voltage": cell.bits_in}
     try:
         chosen = WireSpec(
-            attitude=_quantized(wire.attitude, out, attitude),
-            rate=_quantized(wire.rate, out, rate),
-            voltage=_quantized(wire.voltage, inp, voltage),
+            **{
+                name: _quantized(getattr(wire, name), bits, kind)
+                for (name, bits), kind in zip(signals.items(), kinds, strict=True)
+            },
             actuators=wire.actuators,
             transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
             counter_bits=wire.counter_bits,
@@ -135,8 +142,8 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
     except ValidationError as error:
         why = problem(error, SignalSpec, WireSpec, type(plant))
-        bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
-        raise BurdenError(f"{bits} {cell.quantizer or 'float64'} with sensors {cell.sensors}: {why}") from None
+        name = f"{bits_text(cell.bits_out, cell.bits_in)} {cell.quantizer or 'float64'}"
+        raise GridError(f"{name} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})
 
 
@@ -147,126 +154,41 @@ def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> Signa
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
 
 
-def _pair(text: str) -> _Bits:
+def bits_text(*bits: int | None) -> str:
+    """Bits out and in as a text, such as 8/6."""
+    return "/".join("cont" if each is None else str(each) for each in bits)
+
+
+def bits_pair(text: str) -> _Bits:
+    """Bits out and in of a text such as 8/6, cont or 8/cont. Raises GridError."""
     words = text.split("/") if text != "cont" else [text] * 2
     if len(words) != 2 or not all(
         word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words
     ):
-        raise BurdenError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
+        raise GridError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
     out, inp = (None if word == "cont" else int(word) for word in words)
     return out, inp
 
 
-def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
-    """The names without repetitions, or all choices if there are none."""
+def chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
+    """The names without repetitions, or all choices if there are none. Raises GridError if one is no choice."""
     for name in names:
         if name not in choices:
-            raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
+            raise GridError(f"{option} takes {', '.join(choices)}, not {name!r}")
     return list(dict.fromkeys(names or choices))
-
-
-# ── frames on a classic CAN bus ──
-
-BITRATE: Final = 1_000_000
-"""Bit rate for the load, the highest of classic CAN [bit/s]."""
-
-
-def classic_frame_bits(data_bytes: int) -> int:
-    """Bits of one classic frame of 0…8 data bytes with worst-case stuffing, interframe space included.
-
-    Besides its data, a frame with an 11-bit identifier has 34 bits under stuffing and 13 without. After five equal bits
-    the sender stuffs an opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril
-    and Lukkien, Controller Area Network schedulability analysis, 2007).
-
-    Raises:
-        ValueError: A classic frame does not hold so many bytes.
-    """
-    if not 0 <= data_bytes <= CLASSIC_BYTES:
-        raise ValueError(f"a classic CAN frame holds 0 to {CLASSIC_BYTES} bytes, not {data_bytes}")
-    stuffed = 34 + 8 * data_bytes
-    return stuffed + (stuffed - 1) // 4 + 13
-
-
-def classic_frames(size: int) -> list[int]:
-    """Data bytes of each classic frame that a frame of the loop of `size` ≥ 1 bytes fills.
-
-    A frame of more than eight bytes goes as one CAN FD frame in this project; here it is split without a header.
-    """
-    full, rest = divmod(size, CLASSIC_BYTES)
-    return [CLASSIC_BYTES] * full + [rest] * (rest > 0)
-
-
-def bus_bits(size: int) -> int:
-    """Worst-case bits on a classic bus of a frame of the loop of `size` bytes."""
-    return sum(map(classic_frame_bits, classic_frames(size)))
 
 
 # ── points ──
 
-POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
-
-
-class Traffic(StreamFigures):
-    """Traffic of one direction under one policy, over the whole run."""
-
-    frames_per_s: float
-    bits_per_s: float = Field(description="payload bits, padding included")
-    changes_per_s: float = Field(description="changes of a component's code, of all components together")
-    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order")
-    mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
-    least_interval_ms: float | None = Field(description="the least of these times [ms]")
-    can_frames: int = Field(
-        description="classic CAN frames that a frame fills; more than one is a split, without any header, of what "
-        "this project sends as one CAN FD frame"
-    )
-    can_bits_per_s: float = Field(description="bits on a classic CAN bus, with worst-case stuffing")
-    can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
-
-
-class Point(BaseModel):
-    """One cell under one policy. Missing figures are null, with the reason."""
-
-    model_config = ConfigDict(frozen=True)
-
-    bits_out: int | None = Field(description="bits of ε and ω; null is float64")
-    bits_in: int | None = Field(description="bits of u; null is float64")
-    quantizer: str | None = Field(
-        description="the kind of every signal, or hysteresis-rate: hysteresis-uniform for ω, uniform for the others; "
-        "null where nothing is quantized"
-    )
-    sensors: str = Field(description="a name of `Burden.sensors`")
-    transmit: Policy
-    z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")
-    u_total: float | None = Field(default=None, description="∫ uᵀu dt of the commands as sent [V²·s]")
-    measurement: Traffic | None = None
-    command: Traffic | None = None
-    bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
-    can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
-    can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
-    against_float64: dict[str, float] | None = Field(
-        default=None, description="figures over those of float64 at every tick, under the same sensors [1]"
-    )
-    pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
-    reason: str | None = Field(default=None, description="why there are no figures")
-
-    @property
-    def bits(self) -> str:
-        """Bits out and in, as `--bits` takes them."""
-        return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
-
-    @property
-    def label(self) -> str:
-        """Short label: the bits, or float64."""
-        return self.bits if self.quantizer else "float64"
-
-    @property
-    def is_baseline(self) -> bool:
-        """Whether it is the baseline: float64 at every tick."""
-        return self.quantizer is None and self.transmit == "periodic"
-
 
 class Burden(BaseModel):
-    """The grid."""
+    """The grid. A point is one cell under one policy.
+
+    A point has its cell (bits of None are float64), transmit, z_track [s], u_total [V²·s], measurement and command as
+    `traffic` has them, of both together bits_per_s (padding included), can_bits_per_s and can_load; against_float64,
+    these figures over those of float64 at every tick under the same sensors; pareto, whether it is on the front of
+    z_track against bits_per_s; and reason, why there are no figures: then all of them are None.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -275,11 +197,11 @@ class Burden(BaseModel):
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
     counter_bits: int = Field(description="bits of the counter in each frame")
     sensors: dict[str, str] = Field(description="meaning of each name")
-    points: list[Point]
+    points: list[Row]
 
-    def under(self, sensors: str) -> list[Point]:
+    def under(self, sensors: str) -> list[Row]:
         """The points with these sensors."""
-        return [point for point in self.points if point.sensors == sensors]
+        return [point for point in self.points if point["sensors"] == sensors]
 
 
 def measure_burden(
@@ -299,14 +221,14 @@ def measure_burden(
         engine: As of `open_workers`.
 
     Raises:
-        BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
+        GridError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
             configuration.
     """
     runs = [run_of(cell_settings(settings, cell)) for cell in cells]
     progress(0, len(runs))
     with open_workers(engine) as workers:
         observed = workers.rows(partial(observe, duration_s=duration_s), runs, lambda done: progress(done, len(runs)))
-    points = [Point(**cell._asdict(), **row) for cell, rows in zip(cells, observed, strict=True) for row in rows]
+    points = [cell._asdict() | row for cell, rows in zip(cells, observed, strict=True) for row in rows]
     sensors = dict.fromkeys(cell.sensors for cell in cells)
     return Burden(
         duration_s=duration_s,
@@ -315,80 +237,76 @@ def measure_burden(
         counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in sensors},
         points=[
-            point for name in sensors for point in _compared([point for point in points if point.sensors == name], name)
+            point
+            for name in sensors
+            for point in _compared([point for point in points if point["sensors"] == name], name)
         ],
     )
 
 
+_FIGURES: Final = ("z_track", "u_total", "measurement", "command", "bits_per_s", "can_bits_per_s", "can_load")
+
+
 def observe(settings: Settings, duration_s: float) -> list[Row]:
-    """Run one cell, which sends at every tick, for `duration_s` [s]: fields of its point under each policy."""
+    """Run one cell, which sends at every tick, for `duration_s` [s]: its point under each policy."""
     wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
-    frames: list[tuple[bytes, bytes]] = []
     try:
-        found = experiment(settings, duration_s, watch=lambda _k, *both: frames.append(both))
+        figures, course, _ = experiment(settings, duration_s)
     except LoopEndedError as error:
-        return [{"transmit": policy, "reason": str(error)} for policy in POLICIES]
-    kinds = wire.measurement, wire.command
-    if found.course is not None:
-        codes = [found.course.measured, found.course.commanded]
-    else:
-        codes = [codes_of(each, kind) for each, kind in zip(zip(*frames, strict=True), kinds, strict=True)]
+        return [{"transmit": policy, **dict.fromkeys(_FIGURES), "reason": str(error)} for policy in POLICIES]
     rows = []
     for policy in POLICIES:
-        measurement, command = (
-            traffic(each, kind, sent_ticks(each, policy, heartbeat), period)
-            for each, kind in zip(codes, kinds, strict=True)
+        out, inp = (
+            traffic(codes, kind, sent_ticks(codes, policy, heartbeat), period)
+            for codes, kind in ((course.measured, wire.measurement), (course.commanded, wire.command))
         )
-        both = {
-            name: getattr(measurement, name) + getattr(command, name)
-            for name in ("bits_per_s", "can_bits_per_s", "can_load")
-        }
-        figures = {"z_track": found.figures.z_track, "u_total": found.figures.u_total}
-        rows.append({"transmit": policy, "measurement": measurement, "command": command, **figures, **both})
+        both = [out[name] + inp[name] for name in _FIGURES[4:]]
+        values = figures.z_track, figures.u_total, out, inp, *both
+        rows.append({"transmit": policy, **dict(zip(_FIGURES, values, strict=True)), "reason": None})
     return rows
 
 
-def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> Floats:
-    """Codes of frames. Shape (frames, components).
+def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Row:
+    """The traffic of one direction under one policy.
 
-    Raises:
-        ValueError: A frame is malformed.
-    """
-    unpacked = [kind.unpack(frame) for frame in frames]
-    if None in unpacked:
-        raise ValueError("a frame is malformed")
-    return np.array([content[1] for content in unpacked if content is not None], float)
-
-
-def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Traffic:
-    """The traffic of one direction.
+    Changes are those of a code, of all components together and one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order. Intervals
+    are None for less than two frames. On a classic bus of 1 Mbit/s, with worst-case stuffing, can_load above 1 does not
+    fit; can_frames above 1 is a split, without any header, of what this project sends as one CAN FD frame.
 
     Args:
         codes: Codes at every tick from 0 on. Shape (ticks, components).
         kind: Format of the frames.
         sent: Ticks at which a frame was sent.
         period: Time between ticks [s].
-
-    Raises:
-        ValueError: There are no ticks.
     """
-    if not len(codes):
-        raise ValueError("no ticks, no traffic")
     duration = len(codes) * period
     changes = np.count_nonzero(np.diff(codes, axis=0), axis=0) / duration
     intervals = np.diff(sent) * (period * 1e3)
-    on_bus = len(sent) * bus_bits(kind.size) / duration
-    return Traffic(
-        frames_per_s=len(sent) / duration,
-        bits_per_s=len(sent) * kind.size * 8 / duration,
-        changes_per_s=float(changes.sum()),
-        component_changes_per_s=changes.tolist(),
-        mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
-        least_interval_ms=float(intervals.min()) if len(intervals) else None,
-        can_frames=len(classic_frames(kind.size)),
-        can_bits_per_s=on_bus,
-        can_load=on_bus / BITRATE,
-    )
+    full, rest = divmod(kind.size, CLASSIC_BYTES)
+    split = [CLASSIC_BYTES] * full + [rest] * (rest > 0)
+    on_bus = len(sent) * sum(map(classic_frame_bits, split)) / duration
+    return {
+        "frames_per_s": len(sent) / duration,
+        "bits_per_s": len(sent) * kind.size * 8 / duration,  # payload, padding included
+        "changes_per_s": float(changes.sum()),
+        "component_changes_per_s": changes.tolist(),
+        "mean_interval_ms": float(intervals.mean()) if len(intervals) else None,
+        "least_interval_ms": float(intervals.min()) if len(intervals) else None,
+        "can_frames": len(split),
+        "can_bits_per_s": on_bus,
+        "can_load": on_bus / 1e6,
+    }
+
+
+def classic_frame_bits(data_bytes: int) -> int:
+    """Bits of one classic CAN frame of 0…8 data bytes with worst-case stuffing, interframe space included.
+
+    Besides its data, a frame with an 11-bit identifier has 34 bits under stuffing and 13 without. After five equal bits
+    the sender stuffs an opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril
+    and Lukkien, Controller Area Network schedulability analysis, 2007).
+    """
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + (stuffed - 1) // 4 + 13
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
@@ -397,33 +315,32 @@ def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
 
-def _compared(points: Sequence[Point], sensors: str) -> list[Point]:
+def _compared(points: Sequence[Row], sensors: str) -> list[Row]:
     """The points with the same sensors, compared with their baseline and with each other."""
-    baseline = next(point for point in points if point.is_baseline)
-    if baseline.reason is not None:
-        raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
-    if not (baseline.z_track and baseline.u_total):
-        raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
-    done = [point for point in points if point.reason is None]
-    front = pareto_front((_figure(point.bits_per_s), _figure(point.z_track)) for point in done)
-    on_front = {id(point) for point, best in zip(done, front, strict=True) if best}
-    return [
-        point.model_copy(update={"pareto": id(point) in on_front, "against_float64": _ratios(point, baseline)})
-        for point in points
-    ]
-
-
-def _ratios(point: Point, baseline: Point) -> dict[str, float] | None:
-    if point.reason is not None:
-        return None
+    [baseline] = [point for point in points if _is_baseline(point)]
+    if baseline["reason"] is not None:
+        raise GridError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline['reason']}")
+    if not (baseline["z_track"] and baseline["u_total"]):
+        raise GridError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
+    done = [point for point in points if point["reason"] is None]
+    front = iter(pareto_front((point["bits_per_s"], point["z_track"]) for point in done))
     names = ("z_track", "u_total", "bits_per_s", "can_bits_per_s")
-    return {name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names}
+    compared = []
+    for point in points:
+        has_figures = point["reason"] is None
+        ratios = {name: point[name] / baseline[name] for name in names} if has_figures else None
+        found = {"against_float64": ratios, "pareto": has_figures and next(front), "reason": point["reason"]}
+        compared.append({name: value for name, value in point.items() if name != "reason"} | found)
+    return compared
 
 
-def _figure(figure: float | None) -> float:
-    """A figure of a point without a `reason`, which has all of them."""
-    assert figure is not None
-    return figure
+def _is_baseline(point: Row) -> bool:
+    return point["quantizer"] is None and point["transmit"] == "periodic"
+
+
+def bits_of(point: Row) -> str:
+    """Bits out and in, as `--bits` takes them."""
+    return bits_text(point["bits_out"], point["bits_in"])
 
 
 # ── as text ──
@@ -443,56 +360,55 @@ def sheets(burden: Burden) -> Sheets:
     for name, text in burden.sensors.items():
         points = burden.under(name)
         yield f"sensors {name}: {text}", [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
-        reasons = [f"{point.bits} {short_name(point)}: {point.reason}." for point in points[::2] if point.reason]
+        reasons = [
+            f"{bits_of(point)} {_short_name(point)}: {point['reason']}." for point in points[::2] if point["reason"]
+        ]
         if reasons:
             yield "\n".join(reasons), []
     yield from ((note, []) for note in _notes(burden))
 
 
-def short_name(point: Point) -> str:
+def _short_name(point: Row) -> str:
     """Name of a point's quantizer in a table or a legend."""
-    if point.quantizer is None:
-        return "float64"
-    return "hysteresis on ω" if point.quantizer == "hysteresis-rate" else point.quantizer.removesuffix("-uniform")
+    kind: str = point["quantizer"] or "float64"
+    return "hysteresis on ω" if kind == "hysteresis-rate" else kind.removesuffix("-uniform")
 
 
-def _row(always: Point, changed: Point) -> dict[str, str]:
+def _row(always: Row, changed: Row) -> dict[str, str]:
     """A row of a point at every tick, and the same sent on change."""
-    name = {"bits out/in": always.bits, "quantizer": short_name(always)}
-    ratios, out, inp = always.against_float64, changed.measurement, changed.command
-    if ratios is None or out is None or inp is None:
+    name = {"bits out/in": bits_of(always), "quantizer": _short_name(always)}
+    if always["reason"] is not None:
         return name | dict.fromkeys(_COLUMNS, "–")
-    error = ratios["z_track"]
+    error, out, inp = always["against_float64"]["z_track"], changed["measurement"], changed["command"]
     cells = (
-        f"{_figure(always.z_track) * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
-        f"{_figure(always.u_total):.0f}",
-        f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
+        f"{always['z_track'] * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
+        f"{always['u_total']:.0f}",
+        f"{out['changes_per_s']:.0f} + {inp['changes_per_s']:.0f}",
         _payload(always),
         _bus(always),
-        f"{out.frames_per_s:.0f} + {inp.frames_per_s:.0f}",
-        f"{_ms(out.mean_interval_ms)} + {_ms(inp.mean_interval_ms)}",
-        f"{_ms(out.least_interval_ms, 'g')} + {_ms(inp.least_interval_ms, 'g')}",
+        f"{out['frames_per_s']:.0f} + {inp['frames_per_s']:.0f}",
+        f"{_ms(out['mean_interval_ms'])} + {_ms(inp['mean_interval_ms'])}",
+        f"{_ms(out['least_interval_ms'], 'g')} + {_ms(inp['least_interval_ms'], 'g')}",
         _payload(changed),
         _bus(changed),
     )
     return name | dict(zip(_COLUMNS, cells, strict=True))
 
 
-def _payload(point: Point) -> str:
-    assert point.against_float64 is not None
-    star = "★ " if point.pareto else ""
-    return f"{star}{_figure(point.bits_per_s) / 1e3:.1f} ({_share(point.against_float64['bits_per_s'])})"
+def _payload(point: Row) -> str:
+    star = "★ " if point["pareto"] else ""
+    return f"{star}{point['bits_per_s'] / 1e3:.1f} ({_share(point['against_float64']['bits_per_s'])})"
 
 
-def _bus(point: Point) -> str:
+def _bus(point: Row) -> str:
     """Bits a second on the bus, and its load; marks a split frame and a load above 1."""
-    load = _figure(point.can_load)
+    load = point["can_load"]
     words = _share(load) + (", too much" if load > 1 else "")
-    return f"{_figure(point.can_bits_per_s) / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
+    return f"{point['can_bits_per_s'] / 1e3:.0f} ({words}){_SPLIT if _is_split(point) else ''}"
 
 
-def _is_split(point: Point) -> bool:
-    return any(part is not None and part.can_frames > 1 for part in (point.measurement, point.command))
+def _is_split(point: Row) -> bool:
+    return any(part and part["can_frames"] > 1 for part in (point["measurement"], point["command"]))
 
 
 def _share(ratio: float) -> str:
@@ -524,3 +440,100 @@ def _notes(burden: Burden) -> Iterator[str]:
             f"{_SPLIT} A frame of more than 8 bytes, reckoned as the classic frames that its bytes fill; in fact it "
             "goes as one CAN FD frame."
         )
+
+
+# ── as a figure ──
+
+
+def draw_burden(burden: Burden, path: Path) -> None:
+    """Draw error against payload bits a second into a file, a panel for each of the sensors, both axes logarithmic.
+
+    Colour and shape mark the quantizer; a full marker is sent on change, a hollow one at every tick. A line joins the
+    Pareto front, its points labelled with bits out/in; dotted lines mark float64 at every tick. Raises OutputError if
+    the file's name is wrong, or it cannot be written.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    from aeroloop.service.report.figure_style import WIDTH_IN, figure_style, save_as
+
+    def key(color: str, marker: str, label: str, face: str | None = None) -> Line2D:
+        face = face or color
+        style = {"marker": marker, "markerfacecolor": face, "linestyle": "none", "markersize": 4, "label": label}
+        return Line2D([], [], color=color, **style)  # type: ignore[arg-type]  # keywords of several types
+
+    names, styles = list(burden.sensors), _styles()
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    with figure_style():
+        size = WIDTH_IN[1 if columns == 1 else 2], 0.75 + 2.5 * rows
+        figure = Figure(figsize=size, layout="constrained")
+        panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
+        for panel, name in zip(panels, names, strict=False):
+            _draw(panel, [point for point in burden.under(name) if point["reason"] is None])
+            panel.annotate(f"sensors: {name}", (1, 1), xycoords="axes fraction", xytext=(-4, -4),
+                           textcoords="offset points", ha="right", va="top",
+                           bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
+        errors = [_place(point)[1] for point in burden.points if point["reason"] is None]
+        panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
+        for i, panel in enumerate(panels):
+            panel.set_visible(i < len(names))
+            if i % columns == 0:
+                panel.set_ylabel(r"$z_\mathrm{track}$ [$10^{-4}$ s]")
+            if i + columns >= len(names):  # the last of its column
+                panel.set_xlabel("payload of measurements and commands [kbit/s]")
+                panel.tick_params(labelbottom=True)
+        drawn = {_short_name(point): styles[point["quantizer"]] for point in burden.points if point["quantizer"]}
+        legend = [
+            *(key(*style, name) for name, style in drawn.items()),
+            key(*styles[None], "float64"),
+            key("0.4", "o", "sent on change"),
+            key("0.4", "o", "sent at every tick", face="white"),
+            Line2D([], [], color="0.45", linewidth=0.9, label="Pareto front, bits out/in"),
+            Line2D([], [], color="0.3", linewidth=0.6, linestyle=":", label="float64 at every tick"),
+        ]
+        figure.legend(handles=legend, loc="outside lower center", ncols=3)
+        save_as(figure, path)
+
+
+def _styles() -> dict[str | None, tuple[str, str]]:
+    """Colour and marker of each quantizer."""
+    from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE
+
+    return {
+        "uniform": (BLUE, "o"),
+        "hysteresis-uniform": (ORANGE, "s"),
+        "logarithmic-uniform": (GREEN, "^"),
+        "hysteresis-rate": (PURPLE, "p"),
+        None: (BLACK, "D"),
+    }
+
+
+def _place(point: Row) -> tuple[float, float]:
+    """Payload [kbit/s] and error [1e-4 s]."""
+    return point["bits_per_s"] / 1e3, point["z_track"] * 1e4
+
+
+def _draw(panel: Axes, points: list[Row]) -> None:
+    from aeroloop.service.report.figure_style import logarithmic
+
+    logarithmic(panel, "x", (1, 2, 3, 5))
+    logarithmic(panel, "y", (1, 2, 3, 5))
+    panel.margins(x=0.08)
+    front = sorted({_place(point): point for point in points if point["pareto"]}.items(), key=lambda item: item[0])
+    panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)
+    for point in points:
+        (color, marker), (payload, error) = _styles()[point["quantizer"]], _place(point)
+        face, order = color if point["transmit"] == "on_change" else "white", 4 if point["pareto"] else 3
+        panel.plot(
+            payload, error, marker, color=color, markersize=4, markerfacecolor=face, linestyle="none", zorder=order
+        )
+        if _is_baseline(point):
+            panel.axvline(payload, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
+            panel.axhline(error, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
+    labelled: list[tuple[float, float]] = []  # to the lower left, where no point is
+    for (x, y), point in front:
+        if all(abs(log10(x / other)) >= 0.2 or abs(log10(y / above)) >= 0.055 for other, above in labelled):
+            labelled.append((x, y))
+            label = bits_of(point) if point["quantizer"] else "float64"
+            panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=6)

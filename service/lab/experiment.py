@@ -7,8 +7,7 @@ clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same f
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from math import nan
 from typing import NamedTuple, TypeAlias
@@ -25,7 +24,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.figures import Figures, Floats, Integers, figures
-from aeroloop.service.lab.loop_function import Run, loop_of
+from aeroloop.service.lab.loop_function import Course, loop_of
 
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
 
@@ -34,14 +33,23 @@ Watch: TypeAlias = Callable[[int, bytes, bytes], None]
 
 
 class LoopEndedError(ValueError):
-    """The plant tripped before the end; one line with time and cause."""
+    """The plant tripped before the end; one line with time and cause.
+
+    Attributes:
+        after_s: The time [s].
+    """
+
+    def __init__(self, after_s: float, causes: list[str]) -> None:
+        super().__init__(f"the loop ended after {after_s:g} s: {'; '.join(causes) or 'no answer'}")
+        self.after_s = after_s
 
 
 class Experiment(NamedTuple):
-    """Figures of an experiment, and the loop's course if it ran as one function."""
+    """Figures of an experiment, the loop's course, and whether it ran as one function."""
 
     figures: Figures
-    course: Run | None = None
+    course: Course
+    compiled: bool
 
 
 def experiment(
@@ -49,56 +57,11 @@ def experiment(
     duration_s: float,
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,
-) -> Experiment:
-    """Run the closed loop as one function if that is possible, else through frames; only then is `watch` called."""
-    loop, wire, ticks = settings.loop, settings.wire, settings.loop.ticks(duration_s)
-    report_every = loop.ticks(1.0)
-    reported = 0
-
-    def report(done: int) -> None:
-        nonlocal reported
-        while progress is not None and reported < done:
-            progress(reported * loop.period)
-            reported += max(1, report_every)
-
-    course = None
-    of_expressions = issubclass(law_class(settings.law), ExpressionLaw)
-    if ticks and of_expressions and settings.plant.actuators == wire.actuators and not settings.plant.faults:
-        course = loop_of(settings).run(settings, ticks, report)
-    if course is None:
-        return Experiment(_through_frames(settings, duration_s, progress, watch))
-    k, transmit, heartbeat = np.arange(ticks), wire.transmit, heartbeat_of(settings)
-    unsent = (
-        ticks - len(sent_ticks(course.measured, transmit.measurement, heartbeat)),
-        ticks - len(sent_ticks(course.commanded, transmit.command, heartbeat)),
-    )
-    return Experiment(_figures(settings, (k, course.errors), (k, course.voltages), unsent), course)
-
-
-def _figures(
-    settings: Settings, errors: tuple[Integers, Floats], commands: tuple[Integers, Floats], unsent: tuple[int, int]
-) -> Figures:
-    watchdog_s = settings.plant.watchdog_s
-    return figures(
-        settings.wire, settings.loop.period, errors, commands, watchdog_s=watchdog_s, unsent=unsent, reasons=REASONS
-    )
-
-
-def heartbeat_of(settings: Settings) -> int:
-    """The most ticks from one frame to the next where frames are sent on change."""
-    return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
-
-
-def run_experiment(
-    settings: Settings,
-    duration_s: float,
-    progress: Callable[[float], None] | None = None,
-    watch: Watch | None = None,
     *,
     plant: Plant | None = None,
     controller: Controller | None = None,
-) -> Figures:
-    """Run the closed loop for `duration_s` of the law's time: through frames, if there is anything to watch or replace.
+) -> Experiment:
+    """Run the closed loop as one function if that is possible, else through frames.
 
     Args:
         settings: The configuration.
@@ -114,8 +77,59 @@ def run_experiment(
         ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
     """
     if watch is None and plant is None and controller is None:
-        return experiment(settings, duration_s, progress).figures
-    return _through_frames(settings, duration_s, progress, watch, plant, controller)
+        course = _as_one_function(settings, duration_s, progress)
+        if course is not None:
+            ticks, transmit, heartbeat = len(course.errors), settings.wire.transmit, heartbeat_of(settings)
+            unsent = (
+                ticks - len(sent_ticks(course.measured, transmit.measurement, heartbeat)),
+                ticks - len(sent_ticks(course.commanded, transmit.command, heartbeat)),
+            )
+            return Experiment(_figures(settings, np.arange(ticks), course, unsent), course, compiled=True)
+    if plant is not None:
+        return _through_frames(settings, duration_s, progress, watch, plant, controller)
+    with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
+        return _through_frames(settings, duration_s, progress, watch, made, controller)
+
+
+def run_experiment(
+    settings: Settings,
+    duration_s: float,
+    progress: Callable[[float], None] | None = None,
+    watch: Watch | None = None,
+    *,
+    plant: Plant | None = None,
+    controller: Controller | None = None,
+) -> Figures:
+    """Figures of an experiment; arguments and errors are those of `experiment`."""
+    return experiment(settings, duration_s, progress, watch, plant=plant, controller=controller).figures
+
+
+def _as_one_function(settings: Settings, duration_s: float, progress: Callable[[float], None] | None) -> Course | None:
+    loop, ticks, reported = settings.loop, settings.loop.ticks(duration_s), 0
+
+    def report(done: int) -> None:
+        nonlocal reported
+        while progress is not None and reported < done:
+            progress(reported * loop.period)
+            reported += max(1, loop.ticks(1.0))
+
+    of_expressions = issubclass(law_class(settings.law), ExpressionLaw)
+    if not ticks or not of_expressions or settings.plant.faults or settings.plant.actuators != settings.wire.actuators:
+        return None
+    return loop_of(settings).run(settings, ticks, report)
+
+
+def _figures(settings: Settings, used: Integers, course: Course, unsent: tuple[int, int]) -> Figures:
+    errors, commands = (used, course.errors), (np.arange(len(course.voltages)), course.voltages)
+    watchdog_s = settings.plant.watchdog_s
+    return figures(
+        settings.wire, settings.loop.period, errors, commands, watchdog_s=watchdog_s, unsent=unsent, reasons=REASONS
+    )
+
+
+def heartbeat_of(settings: Settings) -> int:
+    """The most ticks from one frame to the next where frames are sent on change."""
+    return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
 
 
 def _through_frames(
@@ -123,12 +137,9 @@ def _through_frames(
     duration_s: float,
     progress: Callable[[float], None] | None,
     watch: Watch | None,
-    plant: Plant | None = None,
-    controller: Controller | None = None,
-) -> Figures:
-    if plant is None:
-        with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
-            return _through_frames(settings, duration_s, progress, watch, made, controller)
+    plant: Plant,
+    controller: Controller | None,
+) -> Experiment:
     loop, wire = settings.loop, settings.wire
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
     limits = settings.plant.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost)
@@ -140,24 +151,29 @@ def _through_frames(
         raise ValueError(answer.reason)
 
     level = wire.voltage.quantizer().level
-    voltages = [nan] * wire.actuators
-    used, errors, commands = list[int](), list[Vector](), list[list[float]]()
+    seen: list[float] = [nan] * 6
+    codes, voltages = [nan] * wire.actuators, [nan] * wire.actuators
+    used, errors = list[int](), list[Vector]()
+    measured, commanded, commands = list[list[float]](), list[list[float]](), list[list[float]]()
     silent = [0, 0]  # measurements and commands without a frame
     report_every = loop.ticks(1.0)
     measurement = endpoint.tick(None, 0)
-    for k in _undisturbed(loop.ticks(duration_s)):
+    for k in range(loop.ticks(duration_s)):
         command = controller.tick(measurement, k)
         if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
-            if controller.fault is not None:
-                trips = [controller.fault]
-            raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
+            raise LoopEndedError(k * loop.period, trips if controller.fault is None else [controller.fault])
         if controller.tick_index == k:  # it used the measurement
             used.append(k)
             errors.append(controller.attitude_error)
             silent[0] += measurement == UNCHANGED
+        if measurement and (read := wire.measurement.unpack(measurement)):
+            seen = list(read[1])
         if read := wire.command.unpack(command):
-            voltages = [level(code) for code in read[1]]
+            codes = list(read[1])
+            voltages = [level(code) for code in codes]
+        measured.append(seen)
+        commanded.append(codes)
         commands.append(voltages)
         silent[1] += command == UNCHANGED
         if watch is not None and measurement is not None:
@@ -165,11 +181,10 @@ def _through_frames(
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
-    return _figures(
-        settings,
-        (np.array(used, dtype=np.int64), np.array(errors).reshape(-1, 3)),
-        (np.arange(len(commands)), np.array(commands).reshape(-1, wire.actuators)),
-        (silent[0], silent[1]),
+    rows = ((measured, 6), (commanded, wire.actuators), (commands, wire.actuators), (errors, 3))
+    course = Course(*(np.array(each, float).reshape(-1, columns) for each, columns in rows))
+    return Experiment(
+        _figures(settings, np.array(used, dtype=np.int64), course, (silent[0], silent[1])), course, compiled=False
     )
 
 
@@ -184,17 +199,6 @@ def _plant(settings: Settings) -> Plant:
     faulty = settings.plant.with_faults(plant, settings.loop.period)
     faulty.start()
     return faulty
-
-
-def _undisturbed(ticks: int) -> Iterator[int]:
-    """Tick indices, with the garbage collector off meanwhile: the loop makes no cycles to collect."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield from range(ticks)
-    finally:
-        if collects:
-            gc.enable()
 
 
 def sent_ticks(codes: Floats, policy: Policy, heartbeat: int) -> Integers:

@@ -8,28 +8,54 @@ and sensors, until the attitude error leaves a bound or the plant trips.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import groupby, product
+from math import inf
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.baselines import NonadaptiveSettings, TrackingSettings
-from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
+from aeroloop.service.control.laws.baselines import (
+    TUNED,
+    NonadaptiveSettings,
+    Response,
+    TrackingSettings,
+    response_of,
+    tuned,
+)
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
-from aeroloop.service.lab.burden import SENSORS
-from aeroloop.service.lab.law_margins import PUSHED_S, survived
-from aeroloop.service.lab.sweep import Progress, Row, RowFile, Sheets, SweepPlan, rows_file, sweep_rows, write_table
-from aeroloop.service.lab.workers import PROCESSES, open_workers, run_of
+from aeroloop.service.lab.burden import SENSORS, bits_pair, bits_text, chosen
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.sweep import (
+    PROCESSES,
+    Progress,
+    Row,
+    Sheets,
+    SweepPlan,
+    open_workers,
+    run_of,
+    sweep_rows,
+    write_table,
+)
 
-LAWS: Final = ("adaptive", "nonadaptive", *RULES)
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# ── what is compared ──
+
+LAWS: Final = ("adaptive", "nonadaptive", *TUNED)
 BITS: Final = ("8/6", "cont/cont")
 WINDS: Final = {"calm": False, "wind": True}
 PLANTS: Final = ("aero", "rigid_body")
@@ -48,10 +74,6 @@ class Choice(NamedTuple):
     sensors: str
     wind: str
     plant: str
-
-
-class LawsError(AeroloopError):
-    """The comparison cannot be made; one line with the reason."""
 
 
 class Comparison(NamedTuple):
@@ -91,18 +113,14 @@ def compare(
         within_deg: Bound of the attitude error, for the margins [deg].
 
     Raises:
-        LawsError: An unknown name.
+        GridError: An unknown name.
         ConfigError, PluginError, LawError: A combination is no configuration, or has no such law.
     """
-    for option, given, known in (("--sensors", sensors, [*SENSORS]), ("--wind", winds, [*WINDS])):
-        if unknown := [name for name in given if name not in known]:
-            raise LawsError(f"{option} {unknown[0]!r} is not known: it is one of {', '.join(known)}")
-    if wrong := [pair for pair in bits if pair.count("/") != 1]:
-        raise LawsError(f"--bits takes bits out and in, such as 8/6 or cont/cont, not {wrong[0]!r}")
     found = list[tuple[Choice, Configuration]]()
-    chosen = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
-    axes = chosen, sensors or ("encoders",), winds or WINDS, bits or BITS
-    for plant, sensor, wind, pair in product(*map(dict.fromkeys, axes)):
+    bodies = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
+    levels, airs = chosen("--sensors", sensors or ("encoders",), SENSORS), chosen("--wind", winds, WINDS)
+    pairs = dict.fromkeys(bits_text(*bits_pair(text)) for text in bits or BITS)
+    for plant, sensor, wind, pair in product(dict.fromkeys(bodies), levels, airs, pairs):
         for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
             choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
             if all(choice != other for other, _ in found):
@@ -117,12 +135,12 @@ def compare(
 
 def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]]:
     """A combination as it can be had, and its overrides: a body without joints has no encoders."""
-    out, _, inp = choice.bits.partition("/")
+    out, inp = bits_pair(choice.bits)
     changes: dict[str, Any] = {
         "wire": {
-            "attitude": {"bits": _bits(out)},
-            "rate": {"bits": _bits(out)},
-            "voltage": {"bits": _bits(inp)},
+            "attitude": {"bits": out},
+            "rate": {"bits": out},
+            "voltage": {"bits": inp},
             "transmit": {"measurement": "on_change", "command": "on_change"},
         },
         "plant": {"kind": choice.plant},
@@ -155,10 +173,6 @@ def _motors(settings: Settings, kind: str) -> int:
     plant = load_over(settings, [f"plant.kind={kind}"]).plant.make(settings.loop.period)
     plant.close()
     return plant.actuators
-
-
-def _bits(text: str) -> int | str:
-    return int(text) if text.isdecimal() else text
 
 
 def three_motors(allocation: Sequence[Sequence[float]]) -> list[list[float]]:
@@ -203,38 +217,21 @@ def _response(settings: Settings) -> Response:
 # ── the comparison ──
 
 
-class LawRow(BaseModel):
-    """Figures of a combination, mean over the seeds; errors are the largest of any. Null with a reason."""
-
-    model_config = ConfigDict(frozen=True)
-
-    law: str
-    bits: str = Field(description="of ε and ω, and of u; cont is float64")
-    sensors: str
-    wind: str
-    plant: str
-    z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")
-    u_total: float | None = Field(default=None, description="∫ uᵀu dt of the commands as sent [V²·s]")
-    max_error_deg: float | None = Field(default=None, description="largest attitude error as measured [deg]")
-    second_half_error_deg: float | None = Field(default=None, description="the same in the second half: settled [deg]")
-    command_changes_per_s: float | None = Field(default=None, description="chatter: changes of a voltage [1/s]")
-    bits_per_s: float | None = Field(default=None, description="payload of both directions, sent on change [bit/s]")
-    reason: str | None = Field(default=None, description="why there are no figures, of the first seed that has none")
-
-
-class LawMargin(BaseModel):
-    """What a law survives, calm, with the first of bits and sensors."""
-
-    model_config = ConfigDict(frozen=True)
-
-    law: str
-    plant: str
-    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
-    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
+_MEANS: Final = ("z_track", "u_total", "command_changes_per_s")
+_WORST: Final = ("max_error_deg", "second_half_error_deg")
+_MARGINS: Final = {
+    "delay_ms": "largest further delay of commands within the bound [ms]; null: none is",
+    "lost_frames": "most commands lost in a row, again and again; null: none may be",
+}
 
 
 class Laws(BaseModel):
-    """The comparison."""
+    """The comparison.
+
+    A row has its `Choice`, figures by the names of `Figures` (means over the seeds, and the largest errors of any),
+    bits_per_s of both directions, sent on change, and reason, why there are no figures: then all of them are None. A
+    margin has law, plant, delay_ms and lost_frames: what the law survives, calm, with the first of bits and sensors.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -247,8 +244,8 @@ class Laws(BaseModel):
     margin_duration_s: float = Field(description="length of a run with delay or lost frames [s]")
     margin_at: str = Field(description="bits of these; the sensors are the first of each plant")
     gains: dict[str, dict[str, Any]] = Field(description="settings of each law, for the first plant")
-    rows: list[LawRow]
-    margins: list[LawMargin]
+    rows: list[Row]
+    margins: list[Row]
     out: str | None = Field(description="table of all experiments")
 
 
@@ -267,82 +264,131 @@ def run_comparison(
         progress: Called with experiments and searches done, and in all.
 
     Raises:
-        SweepError, OutputError, WorkersError: As of `run_sweep`.
+        SweepError, OutputError: As of `run_sweep`.
     """
-    plan, choices = comparison.plan, comparison.choices
-    pushed = list(_pushed(comparison))
-    before = len(choices) * plan.seeds
-    total = before + len(pushed)
-    searches = [run_of(plan.settings, overrides) for _, overrides in pushed]
-    with RowFile(out and rows_file(out)) as file, open_workers(engine) as workers:
-        rows = sweep_rows(plan, workers, file, lambda done, _: progress(done, total))
-        limits: list[Row] = workers.rows(
-            partial(survived, within_deg=comparison.within_deg), searches, lambda done: progress(before + done, total)
-        )
-    margins = [LawMargin(law=choice.law, plant=choice.plant, **limit)
-               for (choice, _), limit in zip(pushed, limits, strict=True)]  # fmt: skip
+    plan, choices, response, within_deg = comparison
+    searched = dict[tuple[str, str], tuple[str, ...]]()  # calm, with the first of bits and sensors that a plant has
+    for choice, configuration in zip(choices, plan.configurations, strict=True):
+        calm = ("plant.wind.blowing=false",) if choice.wind in WINDS else ()
+        searched.setdefault((choice.law, choice.plant), (*configuration.overrides, *calm))
+    before, work = len(choices) * plan.seeds, partial(survived, within_deg=within_deg)
+    total, searches = before + len(searched), [run_of(plan.settings, overrides) for overrides in searched.values()]
+    with open_workers(engine) as workers:
+        rows = sweep_rows(plan, workers, out, lambda done, _: progress(done, total))
+        margins = workers.rows(work, searches, lambda done: progress(before + done, total))
+    of = dict(zip(searched, margins, strict=True))
     if out is not None:
-        write_table(out, plan, rows, _margin_columns(comparison, margins))
-    first = choices[0]
+        further = (of[choice.law, choice.plant] for choice in choices for _ in range(plan.seeds))
+        texts = {**_MARGINS, "within_deg": "bound of the attitude error, for the margins [deg]"}
+        whole = [row | margin | {"within_deg": within_deg} for row, margin in zip(rows, further, strict=True)]
+        write_table(out, plan, whole, texts)
+    first, gains = choices[0], dict[str, dict[str, Any]]()
+    for choice, configuration in zip(choices, plan.configurations, strict=True):
+        if choice.plant == first.plant:
+            law = with_law_settings(load_over(plan.settings, configuration.overrides)).description()["law"]
+            gains[choice.law] = law
     return Laws(
         duration_s=plan.duration_s,
         seeds=plan.seeds,
-        bandwidth=list(comparison.response.bandwidth),
-        damping_ratio=list(comparison.response.damping),
+        bandwidth=list(response.bandwidth),
+        damping_ratio=list(response.damping),
         period_ms=plan.settings.loop.period * 1e3,
-        within_deg=comparison.within_deg,
+        within_deg=within_deg,
         margin_duration_s=PUSHED_S,
         margin_at=f"{first.bits} bits",
-        gains={choice.law: _gains(plan, configuration) for choice, configuration in
-               zip(choices, plan.configurations, strict=True) if choice.plant == first.plant},
+        gains=gains,
         rows=[_law_row(choice, rows[i * plan.seeds : (i + 1) * plan.seeds]) for i, choice in enumerate(choices)],
-        margins=margins,
+        margins=[{"law": law, "plant": plant, **of[law, plant]} for law, plant in searched],
         out=None if out is None else str(out),
-    )  # fmt: skip
+    )
 
 
-def _gains(plan: SweepPlan, configuration: Configuration) -> dict[str, Any]:
-    law: dict[str, Any] = with_law_settings(load_over(plan.settings, configuration.overrides)).description()["law"]
-    return law
-
-
-def _pushed(comparison: Comparison) -> Iterator[tuple[Choice, tuple[str, ...]]]:
-    """The combinations whose margins are looked for: calm, with the first of bits and sensors that a plant has."""
-    seen = set[tuple[str, str]]()
-    for choice, configuration in zip(comparison.choices, comparison.plan.configurations, strict=True):
-        if (choice.law, choice.plant) not in seen:
-            seen.add((choice.law, choice.plant))
-            calm = ("plant.wind.blowing=false",) if choice.wind in WINDS else ()
-            yield choice, (*configuration.overrides, *calm)
-
-
-def table_extras(within_deg: float) -> dict[str, float]:
-    """Columns with one value that a table of a comparison has beside those of any sweep."""
-    return {"within_deg": within_deg}
-
-
-def _margin_columns(comparison: Comparison, margins: Sequence[LawMargin]) -> dict[str, tuple[Sequence[Any], str]]:
-    of = {(margin.law, margin.plant): margin for margin in margins}
-    each = [of[choice.law, choice.plant] for choice in comparison.choices for _ in range(comparison.plan.seeds)]
-    columns: dict[str, tuple[Sequence[Any], str]] = {
-        name: ([getattr(margin, name) for margin in each], LawMargin.model_fields[name].description or "")
-        for name in ("delay_ms", "lost_frames")
-    }
-    columns["within_deg"] = [comparison.within_deg] * len(each), "bound of the attitude error, for the margins [deg]"
-    return columns
-
-
-def _law_row(choice: Choice, rows: Sequence[dict[str, Any]]) -> LawRow:
+def _law_row(choice: Choice, rows: Sequence[Row]) -> Row:
     """The row of a combination, of those of its seeds."""
+    figures: Row = choice._asdict() | dict.fromkeys(("z_track", "u_total", *_WORST, _MEANS[-1], "bits_per_s", "reason"))
     if reasons := [row["reason"] for row in rows if row["reason"] is not None]:
         several = f"{len(reasons)} of {len(rows)} seeds: " if len(rows) > 1 else ""
-        return LawRow(**choice._asdict(), reason=f"{several}{reasons[0]}")
-    figures: dict[str, Any] = {
-        name: fmean(row[name] for row in rows) for name in ("z_track", "u_total", "command_changes_per_s")
-    }
-    figures |= {name: max(row[name] for row in rows) for name in ("max_error_deg", "second_half_error_deg")}
-    sent = fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)
-    return LawRow(**choice._asdict(), **figures, bits_per_s=sent)
+        return figures | {"reason": f"{several}{reasons[0]}"}
+    figures |= {name: fmean(row[name] for row in rows) for name in _MEANS}
+    figures |= {name: max(row[name] for row in rows) for name in _WORST}
+    return figures | {"bits_per_s": fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)}
+
+
+# ── margins of any law on any plant: runs frame by frame, without a watchdog ──
+
+OLDEST_S: Final = 1.0
+"""No search goes beyond this age of a command [s]."""
+PUSHED_S: Final = 10.0
+"""Length of a run with delay or lost frames [s]."""
+
+
+def survived(settings: Settings, within_deg: float) -> Row:
+    """The longest delay [ms], and the most frames lost in a row, with which the error stays within the bound.
+
+    None if none is. It looks no further than a second.
+    """
+    settings = with_law_settings(settings)
+    most, guess = settings.loop.ticks(OLDEST_S), settings.loop.ticks(0.1)
+    delay = last_good(lambda ticks: largest_error_deg(settings, delay=ticks) <= within_deg, guess, most)
+    lost = last_good(lambda ticks: largest_error_deg(settings, lost=ticks) <= within_deg, guess, most)
+    delay_ms = None if delay is None else round(delay * settings.loop.period * 1e3, 6)
+    return {"delay_ms": delay_ms, "lost_frames": lost}
+
+
+def last_good(good: Callable[[int], bool], guess: int, most: int) -> int | None:
+    """The last number that is good, if all larger ones are not, by bisection from a guess.
+
+    None if 0 is not good, `most` if none is found to be bad by doubling the guess up to it.
+    """
+    low, high = 0, max(1, guess)
+    while good(high):
+        low, high = high, 2 * high
+        if high > most:
+            return most
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low if low or good(0) else None
+
+
+def largest_error_deg(settings: Settings, delay: int = 0, lost: int = 0) -> float:
+    """The largest attitude error in the second half of a run [deg]; infinite if the plant trips or the law fails."""
+    try:
+        with closing(Late(settings.plant.make(settings.loop.period), delay, lost)) as plant:
+            found = run_experiment(settings, PUSHED_S, plant=plant).second_half_error_deg
+    except (AeroloopError, ValueError):
+        return inf
+    return inf if found is None else found
+
+
+class Late(Plant):
+    """A plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
+
+    def __init__(self, plant: Plant, delay: int, lost: int) -> None:
+        self.actuators = plant.actuators
+        self._plant, self._every = plant, lost + 1
+        self._due = deque([(0.0,) * plant.actuators] * delay)
+        self._ticks = 0
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Take the command of a tick; the one that is due replaces the one in force."""
+        self._due.append(tuple(voltages))
+        due = self._due.popleft()
+        if self._ticks % self._every == 0:
+            self._plant.actuate(due)
+        self._ticks += 1
+
+    def advance(self) -> None:
+        """Integrate one period."""
+        self._plant.advance()
+
+    def measure(self) -> Measurement:
+        """Sensor values at the end of the last period."""
+        return self._plant.measure()
+
+    def close(self) -> None:
+        """0 V."""
+        self._plant.close()
 
 
 # ── as text ──
@@ -350,54 +396,138 @@ def _law_row(choice: Choice, rows: Sequence[dict[str, Any]]) -> LawRow:
 
 def sheets(laws: Laws) -> Sheets:
     """Figures of each combination, then what each law survives."""
-    for (plant, sensors, wind, bits), found in groupby(laws.rows, lambda r: (r.plant, r.sensors, r.wind, r.bits)):
+    for (plant, sensors, wind, bits), found in groupby(laws.rows, itemgetter("plant", "sensors", "wind", "bits")):
         around = [f"sensors and wind: {wind}"] if sensors == wind else [f"sensors: {sensors}", wind]
         rows = list(found)
         yield " · ".join([plant, *around, f"{bits} bits"]), list(map(_cells, rows))
-        if failed := [f"{row.law}: {row.reason}" for row in rows if row.reason is not None]:
+        if failed := [f"{row['law']}: {row['reason']}" for row in rows if row["reason"] is not None]:
             yield "\n".join(failed), []
-    for plant, margins in groupby(laws.margins, lambda margin: margin.plant):
+    for plant, margins in groupby(laws.margins, itemgetter("plant")):
         title = f"{plant} · calm · {laws.margin_at} · survived with an error within {laws.within_deg:g}°"
-        yield (
-            title,
-            [
-                {
-                    "law": margin.law,
-                    "delay": "none" if margin.delay_ms is None else f"{margin.delay_ms:g} ms",
-                    "frames lost in a row": "none" if margin.lost_frames is None else str(margin.lost_frames),
-                }
-                for margin in margins
-            ],
-        )
-    yield from ((note, []) for note in _notes(laws))
-
-
-def _cells(row: LawRow) -> dict[str, str]:
-    figures = {
-        "z_track 10⁻⁴ s": (row.z_track, "{:.1f}", 1e4),
-        "u_total V²·s": (row.u_total, "{:.0f}", 1),
-        "largest": (row.max_error_deg, "{:.1f}°", 1),
-        "settled": (row.second_half_error_deg, "{:.2f}°", 1),
-        "changes/s": (row.command_changes_per_s, "{:.0f}", 1),
-        "kbit/s": (row.bits_per_s, "{:.1f}", 1e-3),
-    }
-    cells = {
-        name: "–" if value is None else form.format(value * scale) for name, (value, form, scale) in figures.items()
-    }
-    return {"law": row.law} | cells
-
-
-def _notes(laws: Laws) -> Iterator[str]:
-    bandwidth, damping = ("/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (
-        laws.bandwidth, laws.damping_ratio))  # fmt: skip
+        survive = []
+        for each in margins:
+            delay = "none" if each["delay_ms"] is None else f"{each['delay_ms']:g} ms"
+            lost = "none" if each["lost_frames"] is None else str(each["lost_frames"])
+            survive.append({"law": each["law"], "delay": delay, "frames lost in a row": lost})
+        yield title, survive
+    bandwidth, damping = (
+        "/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (laws.bandwidth, laws.damping_ratio)
+    )
     yield (
         f"Tuned to ωₙ = {bandwidth} rad/s and ζ = {damping} of the linearised error, which the paper's gains have "
-        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured."
+        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured.",
+        [],
     )
     yield (
         f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
         f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
-        "that act later, or of which so many in a row never do, again and again, up to 1 s."
+        "that act later, or of which so many in a row never do, again and again, up to 1 s.",
+        [],
     )
     if laws.out is not None:
-        yield f"All experiments: {laws.out}"
+        yield f"All experiments: {laws.out}", []
+
+
+def _cells(row: Row) -> dict[str, str]:
+    cells = {"law": row["law"]}
+    for title, name, scale, form in (
+        ("z_track 10⁻⁴ s", "z_track", 1e4, "{:.1f}"),
+        ("u_total V²·s", "u_total", 1, "{:.0f}"),
+        ("largest", "max_error_deg", 1, "{:.1f}°"),
+        ("settled", "second_half_error_deg", 1, "{:.2f}°"),
+        ("changes/s", "command_changes_per_s", 1, "{:.0f}"),
+        ("kbit/s", "bits_per_s", 1e-3, "{:.1f}"),
+    ):
+        cells[title] = "–" if row[name] is None else form.format(row[name] * scale)
+    return cells
+
+
+# ── as a figure ──
+
+_SHAPES: Final = "osD^vP"
+_PANELS: Final = (
+    (r"$z_\mathrm{track}$ [$10^{-4}$ s]", "z_track", 1e4, True),
+    ("settled error [°]", "second_half_error_deg", 1, True),
+    (r"$u_\mathrm{total}$ [V²·s]", "u_total", 1, False),
+    ("changes of commands [1/s]", "command_changes_per_s", 1, True),
+)
+"""Label, figure, its factor, and whether the axis is logarithmic."""
+
+
+def draw_laws(laws: Laws, path: Path) -> None:
+    """Draw the comparison into a file: a row of panels for each plant and its sensors, a line of marks for each law.
+
+    Colour is calm or wind, a shape the bits. A full bar is the delay that a law survives, a hollow one the frames lost
+    in a row, with their periods. A law without figures has a cross. Raises OutputError if the file's name is wrong, or
+    it cannot be written.
+    """
+    from aeroloop.service.report.figure_style import figure_style, save_as
+
+    with figure_style():
+        save_as(_figure(laws), path)
+
+
+def _figure(laws: Laws) -> Figure:
+    from matplotlib.figure import Figure
+
+    from aeroloop.service.report.figure_style import WIDTH_IN, logarithmic
+
+    place = itemgetter("plant", "sensors")
+    groups = {where: list(each) for where, each in groupby(sorted(laws.rows, key=place), place)}
+    kinds, bits = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits"))
+    height = 0.7 + len(groups) * (0.75 + 0.17 * len(kinds))
+    figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
+    panels = figure.subplots(len(groups), len(_PANELS) + 1, sharey=True, squeeze=False)
+    for line, ((plant, sensors), found) in zip(panels, groups.items(), strict=True):
+        for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
+            values = [factor * (row[name] or 0) for row in found]
+            if is_logarithmic and max(values) > 0:
+                logarithmic(panel, "x", (1, 2, 5))
+            for row, value in zip(found, values, strict=True):
+                _mark(panel, row, value, kinds.index(row["law"]), _SHAPES[bits.index(row["bits"]) % len(_SHAPES)])
+            panel.set_xlabel(label)
+        for margin in laws.margins:
+            if margin["plant"] == plant:
+                y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
+                for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
+                    line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
+        line[-1].set_xlabel("survived [ms]")
+        line[0].set_yticks(range(len(kinds)), kinds)
+        line[0].set_ylim(len(kinds) - 0.4, -0.6)
+        line[0].set_ylabel(f"{plant}, {sensors}")
+    figure.legend(handles=_legend(laws, bits), loc="outside lower center", ncols=6)
+    return figure
+
+
+def _colours() -> dict[str, str]:
+    from aeroloop.service.report.figure_style import BLUE, ORANGE
+
+    return {"calm": BLUE, "wind": ORANGE}
+
+
+def _mark(panel: Axes, row: Row, value: float, line: int, shape: str) -> None:
+    colour = _colours().get(row["wind"], "#222222")
+    y = line + 0.13 * (1 if row["wind"] == "wind" else -1)  # marks of one law that would cover each other
+    if row["reason"] is not None:
+        panel.plot(0.97, y, "x", color=colour, markersize=4, transform=panel.get_yaxis_transform())
+    else:
+        panel.plot(value, y, shape, color=colour, markersize=4, markerfacecolor="none", markeredgewidth=0.9)
+
+
+def _legend(laws: Laws, bits: list[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    winds = {name: colour for name, colour in _colours().items() if any(row["wind"] == name for row in laws.rows)}
+    hollow: dict[str, Any] = {"color": "0.4", "markerfacecolor": "none", "linestyle": "none", "markersize": 4}
+    bars = (("0.75", "delay"), ("white", "frames lost in a row"))
+    failed = [Line2D([], [], marker="x", label="did not last", **hollow)]
+    return [
+        *(Line2D([], [], color=colour, linewidth=4, label=name) for name, colour in winds.items()),
+        *(
+            Line2D([], [], marker=_SHAPES[i % len(_SHAPES)], label=f"{pair} bits", **hollow)
+            for i, pair in enumerate(bits)
+        ),
+        *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
+        *(failed if any(row["reason"] for row in laws.rows) else []),
+    ]

@@ -11,9 +11,12 @@ gives its exact reason.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 import casadi as ca
@@ -32,7 +35,6 @@ from aeroloop.service.control.laws.evaluation import configured_gains, initial_s
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law
 from aeroloop.service.control.laws.registry import law_class, law_of
 from aeroloop.service.control.reference import Floats, desired
-from aeroloop.service.lab.c_code import in_c
 
 BLOCK: Final = 512
 """Ticks of one call."""
@@ -43,8 +45,8 @@ _NEAR: Final = 1e-9
 """A value this close to a limit, as a part of it, is left to the frames: sums and roots round differently."""
 
 
-class Run(NamedTuple):
-    """What a loop did at each tick, all of it finite.
+class Course(NamedTuple):
+    """What a loop did at each tick.
 
     Attributes:
         measured: Codes of the measurements. Shape (ticks, 6).
@@ -142,7 +144,7 @@ class Loop:
         self._rows = {name: np.asarray(inputs[name]).reshape(BLOCK, -1) for name in ("desired", "wind", "error")}
         self._after, self._out = (np.asarray(outputs[name]).reshape(BLOCK, -1) for name in ("after", "out"))
 
-    def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Run | None:
+    def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Course | None:
         """Run so many ticks, at least one; None if anything is abnormal. `report` is called with the ticks done."""
         self._ticks += ticks
         if self._ticks >= COMPILED_FROM and not self._tried_c:
@@ -164,8 +166,8 @@ class Loop:
         ends = np.cumsum(list(self._outputs.values()))
         parts = dict(zip(self._outputs, np.split(out, ends[:-1], axis=1), strict=True))
         u, seen = parts.pop("u"), parts.pop("seen")
-        run = Run(**parts)
-        return run if _normal(settings, run.voltages, u, seen) else None
+        course = Course(**parts)
+        return course if _normal(settings, course.voltages, u, seen) else None
 
     def inputs(self, settings: Settings, ticks: int) -> dict[str, Floats]:
         """Inputs of every tick, by name, a row each; the state at the first. Random numbers as the plant draws them."""
@@ -248,3 +250,28 @@ def loop_of(settings: Settings) -> Loop:
             del _loops[next(iter(_loops))]
         _loops[key] = Loop(settings)
     return _loops[key]
+
+
+def in_c(function: ca.Function) -> ca.Function | None:
+    """The same function in C, compiled by CasADi's importer and several times as fast as its virtual machine.
+
+    `-ffp-contract=off` keeps every rounding, so the bits are the same. None where there is no compiler, or it fails.
+    """
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        return None
+    generator = ca.CodeGenerator(f"{function.name()}.c")
+    generator.add(function)
+    try:
+        with TemporaryDirectory(prefix="aeroloop-") as folder:  # what is loaded stays, without its file
+            source = Path(folder, generator.generate(f"{folder}/"))
+            options: dict[str, Any] = {
+                "compiler": compiler,
+                "linker": compiler,
+                "compiler_flags": ("-O1", "-ffp-contract=off"),
+                "directory": f"{folder}/",
+                "cleanup": False,  # the folder goes as a whole
+            }
+            return ca.external(function.name(), ca.Importer(str(source), "shell", options))
+    except (OSError, RuntimeError):  # no place for files, or no library came of it
+        return None

@@ -6,7 +6,6 @@ recorder decoded, copies everything else, and merges the files of a rotated run 
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 from mcap.records import Message
@@ -14,7 +13,7 @@ from mcap.records import Message
 from aeroloop.protocol.messages import topics
 from aeroloop.service.logs.mcap_file import Damage
 from aeroloop.service.logs.recording import Progress, Recording
-from aeroloop.service.logs.recover import Follow, McapCopy
+from aeroloop.service.logs.recover import McapCopy
 from aeroloop.service.viewers.channels import Decoder
 
 
@@ -35,27 +34,20 @@ def write_decoded(recording: Recording, out: Path, progress: Progress) -> tuple[
         def report(read: int) -> None:
             progress((done + read) / size)
 
-        def follow(topic: str) -> Follow | None:
-            """None for topics that the recorder decoded: they begin with a slash, as no key can."""
-            return None if topic.startswith("/") else partial(_decode, copy, decoder, topics.read_key(topic))
+        def decode(topic: str, message: Message) -> None:
+            """Add the decoded forms of a message, with its time of publication as log time, as the recorder does."""
+            address = topics.read_key(topic)
+            for one in decoder.take(address, message.data, message.publish_time) if address is not None else ():
+                schema = copy.schema(one.shape.name, one.shape.encoding, one.shape.schema)
+                channel = copy.channel(one.topic, one.shape.message_encoding, schema)
+                copy.add(channel, one.at_ns, one.at_ns, one.data)
 
         for path in recording.paths:
             found: list[Damage] = []
-            copy.file(path, found, report, follow)
+            copy.file(path, found, report, decode, dropped=lambda topic: topic.startswith("/"))
             done += path.stat().st_size
             damages += [f"{path}: {damage.what}" for damage in found]
         copy.finish()
     if decoder.malformed:
         damages.append(f"malformed: {decoder.malformed} of what is decoded")
     return copy.messages, sorted(copy.topics), damages
-
-
-def _decode(copy: McapCopy, decoder: Decoder, address: topics.Address | None, message: Message) -> None:
-    """Add the decoded forms of a message, with its time of publication as log time, as the recorder does."""
-    if address is None:
-        return
-    for decoded in decoder.take(address, message.data, message.publish_time):
-        shape = decoded.shape
-        schema = copy.schema(shape.name, shape.encoding, shape.schema)
-        channel = copy.channel(decoded.topic, shape.message_encoding, schema)
-        copy.add(channel, decoded.at_ns, decoded.at_ns, decoded.data)

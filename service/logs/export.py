@@ -23,11 +23,10 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
-from aeroloop.service.logs.session import Array, Integers, SessionKey
-from aeroloop.service.logs.table import Column, Kind, TruthColumns, columns_of, true_state
+from aeroloop.service.logs.session import Array, SessionKey, Unknown
+from aeroloop.service.logs.table import Column, Kind, columns_of, true_state
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -167,7 +166,8 @@ def _pieces(
         ticks = recompute(session).ticks
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
-            yield columns_of(which, some, _true_at(truths[which], some.k), session.settings)
+            at = np.searchsorted(truths[which][:, 0], some.k, side="right")  # 0: before the first
+            yield columns_of(which, some, np.insert(truths[which], 0, np.nan, axis=0)[at], session.settings)
 
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
@@ -177,26 +177,19 @@ def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[Se
         actuators[which[0]][which[1]] = recording.settings(which).wire.actuators
     found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
     malformed = 0
-    for message in recording.messages(
+    for vehicle, message in recording.messages(
         lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in actuators else None
     ):
         try:
-            true = true_state(message.data, actuators[message.answer])
+            true = true_state(message.data, actuators[vehicle])
         except ValueError:
             malformed += 1
             continue
         if true is not None and true.session is not None and true.session_tick is not None:
             row = true.session_tick, *true.attitude, *true.rate, *true.voltages
-            found[message.answer, true.session].append(row)
+            found[vehicle, true.session].append(row)
     columns = {which: 8 + actuators[which[0]][which[1]] for which in chosen}
     return {which: np.array(sorted(its)).reshape(-1, columns[which]) for which, its in found.items()}, malformed
-
-
-def _true_at(truths: Array, k: Integers) -> TruthColumns:
-    """Latest truth at each tick. Shapes (n, columns)."""
-    at = np.searchsorted(truths[:, 0], k, side="right")
-    true = np.vstack([np.full((1, truths.shape[1]), np.nan), truths])[at]
-    return TruthColumns(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
 
 
 # ── Files ──

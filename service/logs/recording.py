@@ -1,17 +1,14 @@
 """A recording: the files of a run (one, a folder, or those of a rotated run) read as one.
 
-The files are read once for descriptions and the headers of the traces, and again for what is wanted of them: the rows
-of a session, or the JSON messages of some keys.
-
-A description is in a file several times: as a message in a chunk, and as metadata at the file's beginning and end. Why:
-a damaged copy must not cost the log. A metadata record without its checksum is used only where there is no other copy.
+The files are read once for descriptions and the index of the traces, and again for what is wanted of them: the rows of
+a session, or the JSON messages of some keys.
 """
 
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from math import inf
@@ -24,30 +21,18 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS, Batch, End
+from aeroloop.protocol.messages.trace import ENDS, Batch, End, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import (
-    CHECKSUM,
     DESCRIPTION_METADATA,
+    RECORDER_METADATA,
     Damage,
-    Logged,
     NotMcapError,
     messages,
     records,
 )
-from aeroloop.service.logs.session import (
-    ANSWER_S,
-    BatchKey,
-    Session,
-    SessionKey,
-    Source,
-    TableBuilder,
-    TraceIndex,
-    checked_batch,
-    join,
-    key_of,
-    table_dtype,
-)
+from aeroloop.service.logs.session import ANSWER_S, Session, SessionKey, Source, TableBuilder, join, table_dtype
+from aeroloop.service.logs.trace_index import Entry, TraceIndex, identity_of
 
 Progress = Callable[[float], None]
 """Called repeatedly with the share done, 0…1."""
@@ -74,8 +59,7 @@ class Recording:
 
     Attributes:
         paths: The files, in the order of their first messages.
-        descriptions: The last description of each vehicle and role; `first_descriptions` the first.
-        metadata: Other metadata, by name without prefix (`aeroloop.recorder` is `recorder`); the last of each.
+        metadata: Metadata that are no descriptions, by name without prefix (`aeroloop.recorder` is `recorder`).
         extents: Recorded extent of each session, in the order of recording.
         missing: Rows that the log lacks.
         unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
@@ -87,22 +71,27 @@ class Recording:
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
-        self.descriptions: dict[tuple[str, str], Description] = {}
-        self.first_descriptions: dict[tuple[str, str], Description] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
         self.damages: defaultdict[Path, list[Damage]] = defaultdict(list)
         self.malformed: Counter[str] = Counter()
-        self._progress = progress or (lambda _: None)
-        self._said: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
+        self._descriptions: dict[tuple[str, str], list[tuple[int, Description]]] = {}  # by time of publication, or 0
         self._begun_ns: dict[Source | tuple[SessionKey, End], int] = {}  # first publication of rows
-        self._unreadable: list[tuple[Path, Address, str]] = []  # descriptions
         self._index = TraceIndex()
         begins_ns = {path: _begin_ns(path) for path in _files(paths)}
         self.paths = sorted(begins_ns, key=begins_ns.__getitem__)
-        self._size = sum(path.stat().st_size for path in self.paths)
-        marks = {path: self._read(path) for path in self.paths}
-        self._check_that_all_are_of_one_run(marks)
-        self._sort_out_descriptions()
+        size, done = max(1, sum(path.stat().st_size for path in self.paths)), 0
+        copies: list[tuple[Path, int, str | bytes, Address | None]] = []
+        marks = dict[Path, set[object]]()
+        for path in self.paths:
+
+            def report(read: int, before: int = done) -> None:
+                if progress is not None:
+                    progress(INDEXING * (before + read) / size)
+
+            marks[path] = self._read(path, report, copies)
+            done += path.stat().st_size
+        _check_that_all_are_of_one_run(marks)
+        self._add_descriptions(copies)
         self._index.finish()
         self.malformed["trace"] = self._index.malformed
         self.extents, self.missing, self.unknown = self._index.extents, self._index.missing, self._index.unknown
@@ -154,14 +143,17 @@ class Recording:
         """Sessions of a vehicle, in the order of recording."""
         return [which for which in self.extents if which[0] == vehicle]
 
+    @property
+    def descriptions(self) -> dict[tuple[str, str], Description]:
+        """The last description of each vehicle and role."""
+        return {which: found[-1][1] for which, found in self._descriptions.items()}
+
     def described(self, which: SessionKey) -> dict[str, Description]:
         """Descriptions of a session's vehicle when it began, by role; and of the recorder."""
         found = {role: last for (_, role), last in self.descriptions.items() if role == "recorder"}
         found |= {role: last for (vehicle, role), last in self.descriptions.items() if vehicle == which[0]}
         for end in ENDS:
-            if (which, end) in self._begun_ns and (
-                its := self._described_at(which[0], end, self._begun_ns[which, end])
-            ):
+            if its := self._described_at(which[0], end, self._begun_ns.get((which, end))):
                 found[end] = its
         return found
 
@@ -192,20 +184,20 @@ class Recording:
             ReviewError: The logs have no description of it, or it takes more memory than there is.
             ConfigError: A description is not of this version.
         """
-        settings, wanted = self.settings(which), dict[Source, list[BatchKey]]()
+        settings = self.settings(which)
         first, last = since_s / settings.loop.period, until_s / settings.loop.period
         tables: dict[End, TableBuilder] = {}
+        wanted: dict[End, list[Entry]] = {}
         for end in ENDS:
             until = last + (settings.loop.ticks(ANSWER_S) if end == "plant" else 0)  # when the last answer acts
-            source, keys, rows = self._index.chosen(which, end, first, until)
+            wanted[end] = self._index.part(which, end, first, until)
+            rows = sum(entry.rows for entry in wanted[end])
             check_memory(rows * table_dtype(end, settings.wire).itemsize, rows)
             tables[end] = TableBuilder(end, settings.wire, rows)
-            if source is not None:
-                wanted[source] = keys
-        for source, batch in self.batches(wanted):
-            tables[source.end].add(batch)
+        for end, batch in self._batches(wanted):
+            tables[end].add(batch)
         self.malformed["trace"] += sum(table.malformed for table in tables.values())
-        unknown = self._index.unknown_of(which)
+        unknown = [one for one in self.unknown if (one.vehicle, one.session) == which]
         controller, plant = tables["controller"].table(), tables["plant"].table(unknown)
         k, at_controller, at_plant, acted = join(controller, plant, first, last)
         return Session(
@@ -218,7 +210,7 @@ class Recording:
             changes=[change for change in self._index.changes[which] if change.tick <= last],
             states=tables["controller"].states,
             missing=[gap for gap in self.missing if (gap.vehicle, gap.session) == which],
-            unknown=[one for one in self.unknown if (one.vehicle, one.session) == which],
+            unknown=unknown,
             k=k,
             at_controller=at_controller,
             at_plant=at_plant,
@@ -228,162 +220,140 @@ class Recording:
     def plants(self) -> dict[Source, tuple[Description | None, int]]:
         """Processes of plants, with the description of each as it began, and its recorded rows."""
         return {
-            source: (self._described_at(source.vehicle, "plant", self._begun_ns[source]), rows)
-            for source, rows in self._index.plants.items()
+            source: (
+                self._described_at(source.vehicle, "plant", self._begun_ns[source]),
+                sum(entry.rows for entry in entries),
+            )
+            for source, entries in self._index.entries.items()
+            if source.end == "plant" and entries
         }
 
-    def batches(self, wanted: Mapping[Source, Sequence[BatchKey] | None]) -> Iterator[tuple[Source, Batch]]:
-        """Batches of some processes, each in the order of its rows and none twice; all of them for None."""
-        keys = {source: self._index.keys(source) if some is None else some for source, some in wanted.items()}
-        known = {source: set(some) for source, some in keys.items()}
-        following = dict.fromkeys(keys, 0)
-        waiting: dict[tuple[Source, BatchKey], Batch] = {}
-        for found in self.messages(lambda address: address.vehicle if address.topic.name == "trace" else None):
-            if (batch := checked_batch(found.data)) is None:
-                continue
-            source = Source(found.answer, batch.header.end, batch.header.run)
-            key = key_of(batch.header, found.data)
-            if key not in known.get(source, ()):
-                continue
-            waiting.setdefault((source, key), batch)
-            its = keys[source]
-            while following[source] < len(its) and (source, its[following[source]]) in waiting:
-                key = its[following[source]]
-                known[source].discard(key)
-                following[source] += 1
-                yield source, waiting.pop((source, key))
+    def batches(self, sources: Iterable[Source]) -> Iterator[tuple[Source, Batch]]:
+        """All batches of some processes, each in the order of its rows and none twice."""
+        return self._batches({source: self._index.entries[source] for source in sources})
 
-    def messages(self, wanted: Callable[[Address], T | None]) -> Iterator[Logged[T]]:
-        """Messages of the keys that `wanted` selects, in the order of recording.
+    def _batches(self, wanted: Mapping[T, Sequence[Entry]]) -> Iterator[tuple[T, Batch]]:
+        """Some batches, by any key, in the order that they have there."""
+        orders = {key: deque(entry.identity for entry in entries) for key, entries in wanted.items()}
+        keys = {identity: key for key, order in orders.items() for identity in order}
+        waiting: dict[int, Batch] = {}
+        for vehicle, found in self.messages(lambda address: address.vehicle if address.topic.name == "trace" else None):
+            identity = identity_of(vehicle, found.data)
+            if (key := keys.pop(identity, None)) is None or (batch := read_batch(found.data)) is None:
+                continue
+            waiting[identity] = batch
+            while orders[key] and orders[key][0] in waiting:
+                yield key, waiting.pop(orders[key].popleft())
 
-        `wanted` is called once per key of a file; its result comes with each message of the key, None drops the key.
+    def messages(self, wanted: Callable[[Address], T | None]) -> Iterator[tuple[T, Message]]:
+        """Messages of the keys that `wanted` selects, in the order of recording, each with its result for the key.
+
+        It is called once per key of a file; None drops the key.
         """
+
+        def of(channel: Channel) -> T | None:
+            address = topics.read_key(channel.topic)
+            return None if address is None else wanted(address)
+
         for path in self.paths:
-            yield from messages(path, _by_address(wanted))
+            yield from messages(path, of)
 
     # ── The first look at the files ──
 
-    def _read(self, path: Path) -> set[object]:
-        """Read a file's descriptions, metadata and the headers of its traces; returns what marks its run."""
-        before = sum(other.stat().st_size for other in self.paths[: self.paths.index(path)])
-        addresses: dict[int, Address] = {}
-        descriptions: list[Message] = []
-        metadata: list[Metadata] = []
+    def _read(
+        self,
+        path: Path,
+        progress: Callable[[int], None],
+        copies: list[tuple[Path, int, str | bytes, Address | None]],
+    ) -> set[object]:
+        """Read a file's metadata and index its traces; returns what marks its run.
+
+        Copies of descriptions are appended to `copies`: file, time of publication (0 of metadata), text and key.
+        """
+        addresses: dict[int, Address | None] = {}
         marks: set[object] = set()
+        identity: object = path
+        for record in records(path, self.damages[path], progress):
+            match record:
+                case Channel():
+                    addresses[record.id] = topics.read_key(record.topic)
+                case Metadata(name=name, metadata=entries) if name == DESCRIPTION_METADATA:
+                    copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
+                case Metadata(name=name) if name.startswith("aeroloop."):
+                    content = self._add_metadata(path, record)
+                    if name == RECORDER_METADATA and isinstance(content.get("id"), str):
+                        identity = content["id"]
+                case Message() if (address := addresses.get(record.channel_id)) is not None:
+                    if address.topic.name == "description":
+                        copies.append((path, record.publish_time, record.data, address))
+                    elif address.topic.name == "trace" and (found := self._index.add(address.vehicle, record.data)):
+                        source, session = found
+                        which = address.vehicle, session
+                        marks |= {source, which} if session else {source}
+                        for one in (source, (which, source.end)):
+                            self._begun_ns.setdefault(one, record.publish_time)
+                            self._begun_ns[one] = min(self._begun_ns[one], record.publish_time)
+        return marks and {*marks, identity}
 
-        def chosen(channel: Channel) -> bool:
-            address = topics.read_key(channel.topic)
-            if address is not None and address.topic.name in ("trace", "description"):
-                addresses[channel.id] = address
-            return channel.id in addresses
+    def _add_metadata(self, path: Path, record: Metadata) -> dict[str, Any]:
+        try:
+            content = json.loads(record.metadata.get("json", "{}"))
+        except (ValueError, RecursionError) as error:
+            self.damages[path].append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
+            content = {}
+        content = content if isinstance(content, dict) else {}
+        self.metadata[record.name.removeprefix("aeroloop.")] = content
+        return content
 
-        def report(read: int) -> None:
-            self._progress(INDEXING * (before + read) / self._size)
+    def _add_descriptions(self, copies: Sequence[tuple[Path, int, str | bytes, Address | None]]) -> None:
+        """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
 
-        for record in records(path, self.damages[path], report, chosen):
-            if isinstance(record, Metadata):
-                metadata.append(record)
-            elif isinstance(record, Message) and addresses[record.channel_id].topic.name == "description":
-                descriptions.append(record)
-            elif isinstance(record, Message):
-                vehicle = addresses[record.channel_id].vehicle
-                if found := self._index.add(vehicle, record.data):
-                    source, session = found
-                    began: list[Source | tuple[SessionKey, End]] = [source]
-                    if session:
-                        began.append(((vehicle, session), source.end))
-                        marks.add((vehicle, session))
-                    marks.add(source)
-                    for one in began:
-                        self._begun_ns[one] = min(record.publish_time, self._begun_ns.get(one, record.publish_time))
-        recording = self._add_metadata(path, metadata)
-        copies: list[tuple[bool, int, str | bytes, Address | None]] = [
-            (CHECKSUM in one.metadata, 0, one.metadata.get("json", ""), topics.read_key(one.metadata.get("key", "")))
-            for one in metadata
-            if one.name == DESCRIPTION_METADATA
-        ]
-        descriptions.sort(key=lambda one: one.publish_time)  # a file is in the order of arrival
-        copies += [(True, one.publish_time, one.data, addresses[one.channel_id]) for one in descriptions]
-        self._add_descriptions(path, copies)
-        return marks and {*marks, recording or path}
-
-    def _add_metadata(self, path: Path, metadata: Sequence[Metadata]) -> str | None:
-        """Add the metadata that are no descriptions; returns the identity of the recording, if it has one."""
-        own: dict[str, dict[str, Any]] = {}
-        for one in metadata:
-            if one.name.startswith("aeroloop.") and one.name != DESCRIPTION_METADATA:
-                try:
-                    content = json.loads(one.metadata.get("json", "{}"))
-                except (ValueError, RecursionError) as error:
-                    self.damages[path].append(Damage(0, f"metadata {one.name}: {str(error).splitlines()[0]}"))
-                else:
-                    own[one.name.removeprefix("aeroloop.")] = content if isinstance(content, dict) else {}
-        self.metadata |= own
-        identity = own.get("recorder", {}).get("id")
-        return identity if isinstance(identity, str) else None
-
-    def _add_descriptions(self, path: Path, copies: Sequence[tuple[bool, int, str | bytes, Address | None]]) -> None:
-        """Add a file's copies of descriptions: whether each has a checksum, its time if a message, text and key.
-
-        Raises ReviewError if none is readable.
+        One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
+        end it is a damage. Why: without it, the other end's configuration stands for it.
         """
-        found: dict[bool, list[tuple[int, Description]]] = {False: [], True: []}
-        unreadable = []
-        for checked, at_ns, text, address in copies:
+        unreadable: list[tuple[Path, int, Address | None, str]] = []
+        for path, at_ns, text, address in sorted(copies, key=lambda one: one[1]):
             try:
-                found[checked].append((at_ns, read_description(text, address)))
+                found = read_description(text, address)
             except ValueError as error:
-                unreadable.append(str(error).splitlines()[0])
-                if address is not None and checked:
-                    self._unreadable.append((path, address, unreadable[-1]))
-                else:
-                    self.damages[path].append(Damage(0, f"a description: {unreadable[-1]}"))
-        known = {(one.vehicle, one.role) for _, one in found[True]}
-        sound = [*found[True], *((0, one) for _, one in found[False] if (one.vehicle, one.role) not in known)]
-        if unreadable and not sound:
-            raise ReviewError(f"{path} is not a log of this version: {unreadable[0]}")
-        for at_ns, one in sound:
-            self.descriptions[one.vehicle, one.role] = one
-            self.first_descriptions.setdefault((one.vehicle, one.role), one)
-            if at_ns:
-                self._said[one.vehicle, one.role].append((at_ns, one))
-
-    def _described_at(self, vehicle: str, role: str, at_ns: int) -> Description | None:
-        """The last description that a role published before a time [ns since 1970]; else its first."""
-        before = [(said_ns, one) for said_ns, one in self._said[vehicle, role] if said_ns <= at_ns]
-        return max(before, key=lambda one: one[0])[1] if before else self.first_descriptions.get((vehicle, role))
-
-    def _sort_out_descriptions(self) -> None:
-        """Count unreadable descriptions as malformed messages; the only one of an end that is described is a damage.
-
-        Why: without it, the other end's configuration stands for it.
-        """
-        for path, address, text in self._unreadable:
-            which = address.vehicle, address.role or ""
-            others = {role for vehicle, role in self.descriptions if vehicle == which[0]}
-            if which[1] in ENDS and which not in self.descriptions and others & set(ENDS):
-                self.damages[path].append(Damage(0, f"the description of {'/'.join(which)}: {text}"))
+                unreadable.append((path, at_ns, address, str(error).splitlines()[0]))
             else:
+                self._descriptions.setdefault((found.vehicle, found.role), []).append((at_ns, found))
+        if unreadable and not self._descriptions:
+            raise ReviewError(f"{unreadable[0][0]} is not a log of this version: {unreadable[0][-1]}")
+        for path, at_ns, address, why in unreadable:
+            known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
+            if at_ns and known:
                 self.malformed["description"] += 1
+            else:
+                self.damages[path].append(Damage(0, f"a description: {why}"))
 
-    def _check_that_all_are_of_one_run(self, marks: Mapping[Path, set[object]]) -> None:
-        """Raise ReviewError unless files of different recordings have traces of the same processes or sessions.
+    def _described_at(self, vehicle: str, role: str, at_ns: int | None) -> Description | None:
+        """The last description that a role published before a time [ns since 1970]; else its first."""
+        found = self._descriptions.get((vehicle, role))
+        if found is None or at_ns is None:
+            return None
+        return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
 
-        Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
-        """
-        runs: list[tuple[set[object], list[Path]]] = []
-        for path, its in marks.items():
-            if its:  # else it has no trace to be mixed with others
-                related = [run for run in runs if run[0] & its]
-                runs = [run for run in runs if run not in related]
-                runs.append((its.union(*(run[0] for run in related)), [*chain(*(run[1] for run in related)), path]))
-        if len(runs) > 1:
-            names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
-            some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
-            raise ReviewError(
-                f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
-                "`aeroloop log compare`"
-            )
+
+def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
+    """Raise ReviewError unless files of different recordings have traces of the same processes or sessions.
+
+    Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
+    """
+    runs: list[tuple[set[object], list[Path]]] = []
+    for path, its in marks.items():
+        if its:  # else it has no trace to be mixed with others
+            related = [run for run in runs if run[0] & its]
+            runs = [run for run in runs if run not in related]
+            runs.append((its.union(*(run[0] for run in related)), [*chain(*(run[1] for run in related)), path]))
+    if len(runs) > 1:
+        names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
+        some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
+        raise ReviewError(
+            f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
+            "`aeroloop log compare`"
+        )
 
 
 def read_description(text: str | bytes, address: Address | None) -> Description:
@@ -435,18 +405,10 @@ def available_bytes() -> float:
     return inf
 
 
-def _by_address(wanted: Callable[[Address], T | None]) -> Callable[[Channel], T | None]:
-    def of(channel: Channel) -> T | None:
-        address = topics.read_key(channel.topic)
-        return None if address is None else wanted(address)
-
-    return of
-
-
 def _begin_ns(path: Path) -> int:
     """When a file's first message was recorded [ns since 1970]; 0 without any. Raises ReviewError."""
     try:
-        return next((one.log_time for one in messages(path, lambda _: True)), 0)
+        return next((one.log_time for _, one in messages(path, lambda _: True)), 0)
     except NotMcapError as error:
         raise ReviewError(f"{error}, so it is no log") from None
     except OSError as error:

@@ -57,10 +57,6 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
     return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=list(map(str, damages)))
 
 
-Follow = Callable[[Message], None]
-"""Called with each message of a channel after it was copied."""
-
-
 class McapCopy:
     """Copies records into a new file, which is empty; counts its messages and collects its topics.
 
@@ -81,31 +77,26 @@ class McapCopy:
         path: Path,
         damages: list[Damage],
         progress: Callable[[int], None],
-        follow: Callable[[str], Follow | None] = lambda _: lambda _: None,
+        follow: Callable[[str, Message], object] | None = None,
+        dropped: Callable[[str], bool] = lambda _: False,
     ) -> None:
-        """Copy what a file holds. Arguments and errors are as of `records`; OSError also if it cannot be written.
+        """Copy what a file holds without dropped topics, and call `follow` with the topic of each message and itself.
 
-        `follow` is called with the topic of each channel; it returns a callback for its messages, or None to drop them.
+        Damages, progress and errors are as of `records`; OSError also if the new file cannot be written.
         """
-        schemas: dict[int, int] = {0: 0}  # of the new file, by the ids of this one
-        channels: dict[int, int] = {}
-        followers: dict[int, Follow] = {}
-
-        def chosen(channel: Channel) -> bool:
-            if (follower := follow(channel.topic)) is None:
-                return False
-            schema = schemas.get(channel.schema_id, 0)
-            channels[channel.id] = self.channel(channel.topic, channel.message_encoding, schema, channel.metadata)
-            followers[channel.id] = follower
-            return True
-
-        for record in records(path, damages, progress, chosen):
+        schemas = {0: 0}  # of the new file, by the ids of this one
+        channels: dict[int, tuple[int, str]] = {}
+        for record in records(path, damages, progress):
             match record:
-                case Message(id_, log_time, data, publish_time, sequence):
-                    self.add(channels[id_], log_time, publish_time, data, sequence)
-                    followers[id_](record)
+                case Message(id_, log_time, data, publish_time, sequence) if id_ in channels:
+                    channel, topic = channels[id_]
+                    self.add(channel, log_time, publish_time, data, sequence)
+                    if follow is not None:
+                        follow(topic, record)
                 case Schema():
                     schemas[record.id] = self.schema(record.name, record.encoding, record.data)
+                case Channel(id_, topic, encoding, metadata, schema) if not dropped(topic):
+                    channels[id_] = self.channel(topic, encoding, schemas.get(schema, 0), metadata), topic
                 case Metadata(name=name, metadata=entries):
                     if self._metadata.get(which := (name, entries.get("key"))) != entries:
                         self._metadata[which] = entries
@@ -123,7 +114,7 @@ class McapCopy:
         """Id of a schema in the new file."""
         what = name, encoding, data
         if what not in self._ids:
-            self._ids[what] = self._writer.register_schema(name, encoding, data)
+            self._ids[what] = self._writer.register_schema(*what)
         return self._ids[what]
 
     def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str] | None = None) -> int:

@@ -9,7 +9,7 @@ the log's plant does not respond to that, so it is no simulation.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from typing import Literal
 
@@ -22,11 +22,10 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from aeroloop.service.config import Settings, from_description, load_over
+from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Missing, Session, SessionKey, Source
+from aeroloop.service.logs.session import Missing, Session, SessionKey, Source, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows, levels
 
 
@@ -93,7 +92,12 @@ class Replay(BaseModel, frozen=True):
 
 
 def replay(
-    paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progress | None = None, ends: Collection[End] = ENDS
+    paths: Sequence[Path],
+    overrides: Sequence[str] = (),
+    progress: Progress | None = None,
+    ends: Collection[End] = ENDS,
+    since_s: float = -inf,
+    until_s: float = inf,
 ) -> Replay:
     """Replay every session of a run.
 
@@ -103,6 +107,8 @@ def replay(
             or of the reference replaces every logged change of them. The plant is not replayed then.
         progress: Called repeatedly with the share done, 0…1.
         ends: Ends to replay; the plant takes most of the time.
+        since_s: From when on, on each session's law clock [s]. The plant is not replayed in part.
+        until_s: Until when [s].
 
     Raises:
         ReviewError: It cannot be read, or has no configuration of any end.
@@ -110,42 +116,50 @@ def replay(
     """
     recording = Recording(paths, progress)
     recording.choose()  # raises where there is no session
+    periods = dict[SessionKey, float]()
+
+    def within(one: Missing | Unknown) -> bool:
+        period = periods.get((one.vehicle, one.session))
+        last = inf if one.last_tick is None else one.last_tick
+        return period is None or (one.first_tick <= until_s / period and last >= since_s / period)
+
     details: dict[End, list[str]] = {}
     unseen: dict[End, list[str]] = {}
     reasons: dict[str, str] = {end: "only the other end was replayed" for end in ENDS if end not in ends}
     sessions: list[SessionReplay] = []
     plants: list[PlantReplayed] = []
+    failed: dict[SessionKey, AeroloopError] = {}
     if "controller" in ends:
-        failed: dict[SessionKey, AeroloopError] = {}
-        left = 0
-        for which, extent in recording.extents.items():
-            if extent.rows["controller"]:
-                try:
-                    one, words = _replay_session(recording, which, overrides, progress)
-                    sessions.append(one)
-                    if words:
-                        details.setdefault("controller", words)
-                except AeroloopError as error:
-                    if overrides:
-                        raise
-                    failed[which] = error
-                    left += extent.rows["controller"]
+        for which in (which for which, extent in recording.extents.items() if extent.rows["controller"]):
+            try:
+                periods[which] = recording.settings(which).loop.period
+                one, differences = _replay_session(recording, which, overrides, progress, (since_s, until_s))
+            except AeroloopError as error:
+                if overrides:
+                    raise
+                failed[which] = error
+            else:
+                sessions.append(one)
+                if differences:
+                    details.setdefault("controller", differences)
+        unseen["controller"] = [str(one) for one in recording.unknown if within(one)]
         if failed:
             reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
+            left = sum(recording.extents[which].rows["controller"] for which in failed)
+            unseen["controller"].append(f"{left} of the controller's rows: {reasons['controller']}")
         elif not sessions:
             reasons["controller"] = "the log has no trace of a controller"
-        unseen["controller"] = list(map(str, recording.unknown))
-        if left:
-            unseen["controller"].append(f"{left} of the controller's rows: {reasons['controller']}")
     if overrides:
         reasons["plant"] = "the plant of a log does not follow another configuration"
+    elif (since_s, until_s) != (-inf, inf):
+        reasons.setdefault("plant", "a plant is replayed from its first row on only, so not in part")
     elif "plant" in ends:
         plants, reason, unseen["plant"], details["plant"] = _replay_plants(recording, progress)
         if reason is not None:
             reasons["plant"] = reason
-    if "controller" in ends and failed and not (sessions or plants):
+    if failed and not (sessions or plants):
         raise next(iter(failed.values()))
-    missing = [gap for gap in recording.missing if gap.end in ends]
+    missing = [gap for gap in recording.missing if gap.end in ends and within(gap)]
     for end, its in unseen.items():
         lacks = [f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows]
         unseen[end] = [*lacks, *its, *recording.damaged]
@@ -153,7 +167,7 @@ def replay(
         controller=_sum(sessions),
         plant=_sum([result for result in plants if result.ticks]),
         reasons=reasons,
-        unknown=recording.unknown,
+        unknown=[one for one in recording.unknown if within(one)],
         sessions=sessions,
         plants=plants,
         missing=missing,
@@ -173,22 +187,22 @@ def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay 
 
 
 def _replay_session(
-    recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None
+    recording: Recording,
+    which: SessionKey,
+    overrides: Sequence[str],
+    progress: Progress | None,
+    part_s: tuple[float, float],
 ) -> tuple[SessionReplay, list[str]]:
-    """Replay a session's controller; the first difference also in words. Raises AeroloopError if that cannot be."""
+    """Replay a session; the first difference also in words. Raises AeroloopError if that cannot be."""
     settings = load_over(recording.settings(which), overrides)
     parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
     ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
-    session = recording.session(which)
-
-    def again() -> LoggedController:
-        return LoggedController(session, settings, ignored=ignored, resumes=not overrides)
-
-    logged, rows, wire = again(), session.controller, settings.wire
-    sent_as = np.full(len(rows), int(Sent.NONE), dtype=np.uint8)
-    frames = bytearray(len(rows) * wire.command.size)
-    nothing = bytes(session.settings.wire.command.size)
-    differ, first = 0, -1
+    session = recording.session(which, *part_s)
+    logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
+    rows, wire, period = session.controller, settings.wire, settings.loop.period
+    nothing, blank = bytes(session.settings.wire.command.size), bytes(wire.command.size)
+    sent_as, frames = bytearray(), bytearray()
+    differ: list[int] = []
 
     def share(done: float) -> None:
         if progress is not None:
@@ -198,44 +212,46 @@ def _replay_session(
     for i, (tick, received_as, measurement, logged_as, command) in enumerate(in_rows(columns, share)):
         logged.resume(i)
         answer = logged.answer(tick, received_as, measurement)
-        if answer is not None:
-            sent_as[i] = Sent.FRAME if answer else Sent.SILENT
-            if answer:
-                frames[i * wire.command.size : (i + 1) * wire.command.size] = answer
+        sent_as.append(Sent.NONE if answer is None else Sent.FRAME if answer else Sent.SILENT)
+        frames += answer or blank
         if (sent_as[i], answer or nothing) != (logged_as, command):
-            differ += 1
-            first = i if first < 0 else first
+            differ.append(i)
 
-    computed = np.frombuffer(frames, f"V{wire.command.size}")
-    answered = sent_as != Sent.NONE
+    computed_as, computed = np.frombuffer(sent_as, np.uint8), np.frombuffer(frames, f"V{wire.command.size}")
+    since, until = (at_s / session.settings.loop.period for at_s in part_s)
+    within = (rows["tick"] >= since) & (rows["tick"] <= until)
+    answered, differ = (computed_as != Sent.NONE) & within, [i for i in differ if within[i]]
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
-    after, _ = commanded(session, wire, sent_as, computed)
+    after, _ = commanded(session, wire, computed_as, computed)
     before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
     square, ticks = added(0.0, squares(after - before)), int(answered.sum())
     difference, details = None, list[str]()
     if differ:
-        tick = int(rows["tick"][first])
-        was, now = (
-            bytes(frame) if kind == Sent.FRAME else Sent(int(kind)).name.lower()
-            for kind, frame in ((rows["sent_as"][first], rows["command"][first]), (sent_as[first], computed[first]))
-        )
+        first = differ[0]
+        tick, was_as, now_as = int(rows["tick"][first]), Sent(int(rows["sent_as"][first])), Sent(sent_as[first])
+        was, now = bytes(rows["command"][first]), bytes(computed[first])
         difference = TickDifference(
-            tick=tick, time_s=round(tick * settings.loop.period, 9), logged=_text(was), computed=_text(now)
+            tick=tick,
+            time_s=round(tick * period, 9),
+            logged=was.hex() if was_as == Sent.FRAME else was_as.name.lower(),
+            computed=now.hex() if now_as == Sent.FRAME else now_as.name.lower(),
         )
-        if isinstance(was, bytes) and isinstance(now, bytes):
-            details = in_units(wire.command, _command_signals(wire), was, now)
-        details += _held_before(again(), session, first)
+        if was_as == now_as == Sent.FRAME:
+            signals = [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
+            details = in_units(wire.command, signals, was, now)
+        again = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
+        details += _held_before(again, session, first)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],
-        first_tick=int(rows["tick"][0]) if len(rows) else None,
+        first_tick=int(rows["tick"][within][0]) if within.any() else None,
         ticks=ticks,
-        differ=differ,
+        differ=len(differ),
         first_difference=difference,
         rms_v=sqrt(square / ticks) if ticks else None,
         max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
-        u_total_logged=added(0.0, squares(before)) * settings.loop.period,
-        u_total_computed=added(0.0, squares(after)) * settings.loop.period,
+        u_total_logged=added(0.0, squares(before)) * period,
+        u_total_computed=added(0.0, squares(after)) * period,
     ), details
 
 
@@ -258,10 +274,6 @@ def _held_before(again: LoggedController, session: Session, first: int) -> list[
     return lines
 
 
-def _text(command: bytes | str) -> str:
-    return command.hex() if isinstance(command, bytes) else command
-
-
 # ── The plant ──
 
 
@@ -275,44 +287,39 @@ def _replay_plants(
     """
     replays: dict[Source, PlantReplay] = {}
     reasons: dict[Source, str] = {}
-    settings: dict[Source, Settings] = {}
+    wires: dict[Source, WireSpec] = {}
     rows: dict[Source, int] = {}
     for source, (description, count) in recording.plants().items():
         rows[source] = count
         if description is None:
             reasons[source] = f"the log has no description of {source.vehicle}'s plant"
             continue
-        its = settings[source] = from_description(description.config)
+        its = from_description(description.config)
         if (why := why_not(its.plant)) is not None:
             reasons[source] = why
             del rows[source]  # no log of it could be compared
             continue
         try:
-            replays[source] = PlantReplay(its.loop, its.wire, its.plant)
+            replays[source], wires[source] = PlantReplay(its.loop, its.wire, its.plant), its.wire
         except PlantError as error:
             reasons[source] = str(error)
     done, total = 0, max(1, sum(rows.values()))
-    for source, batch in recording.batches(dict.fromkeys(replays)):
+    for source, batch in recording.batches(replays):
         replays[source].feed(batch)
         done += batch.header.rows
         if progress is not None:
             progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * min(1.0, done / total))
     results = {source: one.result() for source, one in replays.items()}
     reasons |= {source: one.stopped for source, one in results.items() if one.stopped is not None}
-    unseen = []
+    unseen, details = list[str](), list[str]()
     for source, count in rows.items():
         left = count - (results[source].ticks if source in results else 0)
         if left > 0:
             unseen.append(f"{left} of the plant's rows: {reasons.get(source, 'a batch of them cannot be read')}")
+    for source, one in results.items():
+        if one.first_difference is not None and not details:
+            details = _plant_difference(one.first_difference, wires[source])
     none = None if results else "the log has no trace of a plant"
-    details = next(
-        (
-            _plant_difference(one.first_difference, settings[source].wire)
-            for source, one in results.items()
-            if one.first_difference is not None
-        ),
-        [],
-    )
     return list(results.values()), next(iter(reasons.values()), none), unseen, details
 
 
@@ -325,10 +332,6 @@ def _plant_difference(first: PlantDifference, wire: WireSpec) -> list[str]:
 
 
 # ── Differences in words ──
-
-
-def _command_signals(wire: WireSpec) -> list[tuple[str, str, SignalSpec]]:
-    return [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
 
 
 def in_units(

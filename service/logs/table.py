@@ -30,15 +30,6 @@ _PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": 
 """Characters of a unit in a column's name."""
 
 
-class TruthColumns(NamedTuple):
-    """True states at measurements, a row each, in order. Shapes (n,), (n, 4), (n, 3), (n, actuators)."""
-
-    k: Array
-    attitude: Array
-    rate: Array
-    voltages: Array
-
-
 def true_state(data: bytes, actuators: Mapping[str, int]) -> Truth | None:
     """Parse the true state of a tick of one of these sessions, by name with its number of motors; None of another.
 
@@ -66,8 +57,11 @@ class Column(NamedTuple):
     kind: Kind = "double"
 
 
-def columns_of(which: SessionKey, ticks: Ticks, truth: TruthColumns, settings: Settings) -> list[Column]:
-    """Every column of the table of some ticks of a session, with the latest truth at each; NaN before the first."""
+def columns_of(which: SessionKey, ticks: Ticks, truth: Array, settings: Settings) -> list[Column]:
+    """Every column of the table of some ticks of a session, with the latest true state at each; NaN before the first.
+
+    A row of `truth` is a tick, q, ω and the motors' voltages. Shape (n, 8 + actuators).
+    """
     wire, period = settings.wire, settings.loop.period
     n = len(ticks.k)
     motors = list(map(str, wire.motors))
@@ -115,10 +109,10 @@ def columns_of(which: SessionKey, ticks: Ticks, truth: TruthColumns, settings: S
     return [
         *found,
         *_by("unquantized_voltage_{}_V", "V", "u{} before quantization", ticks.unquantized, motors),
-        *_attitude("truth_", "as the emulator had it", truth.attitude),
-        *_by("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", truth.rate, AXES),
-        *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth.voltages, motors),
-        Column("truth_age_s", "s", "from the tick of the truth to this one", (ticks.k - truth.k) * period),
+        *_attitude("truth_", "as the emulator had it", truth[:, 1:5]),
+        *_by("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", truth[:, 5:8], AXES),
+        *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth[:, 8:], motors),
+        Column("truth_age_s", "s", "from the tick of the truth to this one", (ticks.k - truth[:, 0]) * period),
     ]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from math import nan
 from typing import Any, Final, Literal, NamedTuple, Self
 
@@ -139,7 +138,7 @@ class LoggedController:
     ) -> None:
         settings = settings or session.settings
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
-        self._states = session.states if resumes else {i: state for i, state in session.states.items() if i == 0}
+        self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
         self._changes: deque[Change] = deque(session.changes)
         self._ignored: dict[str, None] = dict.fromkeys(ignored)
 
@@ -186,22 +185,21 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     wire, controller, plant = session.settings.wire, session.controller, session.plant
     at, at_plant = session.at_controller, session.at_plant
     check_memory(_BYTES_PER_TICK * len(session.k), len(session.k))
-    by_plant = _is(plant, at_plant, "sent_as", Sent.FRAME)
-    by_controller = (at_plant < 0) & _is(controller, at, "received_as", Received.FRAME)
+    sent_as, received_as = _column(controller, at, "sent_as"), _column(controller, at, "received_as")
+    by_plant = _column(plant, at_plant, "sent_as") == Sent.FRAME
+    by_controller = (at_plant < 0) & (received_as == Received.FRAME)
     frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
     measurements = codes_in(wire.measurement, frames)
-    commands = codes_in(wire.command, controller["command"][at[_is(controller, at, "sent_as", Sent.FRAME)]])
-    del frames
-    silent = _is(controller, at, "sent_as", Sent.SILENT)
-    answered = _is(controller, at, "sent_as", Sent.FRAME) | silent | (session.acted >= 0)
+    commands = codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]])
+    answered = np.isin(sent_as, (Sent.FRAME, Sent.SILENT)) | (session.acted >= 0)
     until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
     wall, sent, latency, there, back, offset_ns = _timed(session)
     volts = _voltages(session)
-    columns, over = _computed(session, progress)
+    columns, missed = _computed(session, progress)
     valid = ~np.isnan(columns[1][:until, 0])  # where q was measured
-    # Of most sessions all ticks are valid and answered: slices copy nothing.
-    judged = slice(until) if valid.all() else np.flatnonzero(valid)
-    if not isinstance(judged, slice):
+    judged: slice | Integers = slice(until)  # of most sessions all ticks are valid: a slice copies nothing
+    if not valid.all():
+        judged = np.flatnonzero(valid)
         for column in columns:
             column[: len(judged)] = column[judged]
     k, wall, sent = (column[judged] for column in (session.k, wall, sent))
@@ -215,80 +213,81 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
         ),
         answered=session.k[commanded_at],
         voltages=volts[commanded_at],
-        missed=session.k[:until][over[:until]],
-        unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int(silent.sum())),
+        missed=session.k[missed[missed < until]],
+        unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int((sent_as == Sent.SILENT).sum())),
         measurements=measurements,
         commands=commands,
         offset_ns=offset_ns,
     )  # fmt: skip
 
 
-def _computed(session: Session, progress: Progress | None) -> tuple[list[Array], Flags]:
-    """What was computed at each tick, and which ticks the plant measured and the controller did not compute.
+def _computed(session: Session, progress: Progress | None) -> tuple[list[Array], Integers]:
+    """What was computed at each tick, and the places of ticks that the plant measured and the controller did not.
 
     The columns are the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u. Shapes (n, …).
     """
-    logged, hypothetical = LoggedController(session), LoggedController(session)
-    hypothetical.controller.leave_out_law()
+    logged = LoggedController(session)
     outputs, last = logged.controller.outputs, logged.controller.last_valid
     names = list(outputs)[: list(outputs).index("u") + 1]
     widths = [len(last["state_next"]), *(len(outputs[name]) for name in names)]
     ends = np.cumsum(widths).tolist()
     table = np.full((len(session.k), ends[-1]), nan)
     memory, row_bytes, state_bytes = table.reshape(-1).view(np.uint8).data, 8 * ends[-1], 8 * ends[0]
-    found, used = logged.controller.row[: ends[-1] - ends[0]].cast("B"), last["state_next"].cast("B")
+    found, state = logged.controller.row[: ends[-1] - ends[0]].cast("B"), last["state_next"].cast("B")
     measured, computed = outputs["measured"], outputs["computed"]
-    beside = hypothetical.controller
-    without = beside.row[: ends[-1] - ends[0]].cast("B")
-
-    plant, at_plant = session.plant, session.at_plant
-    framed = np.flatnonzero(plant["sent_as"] == Sent.FRAME).astype(np.int32)  # a silent row repeats the levels before
-    over = (at_plant >= 0) & ~_is(plant, at_plant, "sent_as", Sent.NONE)
-    followed = -2
-
-    def compute_without(place: int) -> None:
-        """Compute a tick that only the plant has, from the state that the controller had after its last one."""
-        nonlocal followed
-        before, tick = int(np.searchsorted(framed, at_plant[place], side="right")), int(session.k[place])
-        if before:
-            if followed != logged.controller.tick_index:
-                followed = logged.controller.tick_index
-                for name in ("q", "state_next"):
-                    beside.last_valid[name][:] = last[name]
-            hypothetical.change(tick)
-            beside.tick(plant["measurement"][framed[before - 1]].tobytes(), tick)
-            if beside.outputs["measured"][0]:
-                at = place * row_bytes
-                memory[at + state_bytes : at + row_bytes] = without
 
     places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
-    waiting = deque(np.flatnonzero(over & (session.at_controller < 0)).tolist())
+    over = np.isin(_column(session.plant, session.at_plant, "sent_as"), (Sent.NONE, -1), invert=True)
     failed: list[int] = []
-    used_state = bytearray(state_bytes)
+    state_before = bytearray(state_bytes)
     inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
     for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
-        while waiting and session.k[waiting[0]] < tick:
-            compute_without(waiting.popleft())
         logged.resume(i)
-        used_state[:] = used
-        if logged.answer(tick, received_as, frame) is None:
-            if place >= 0 and over[place]:
-                compute_without(place)
-        elif place >= 0:
+        state_before[:] = state
+        if logged.answer(tick, received_as, frame) is not None and place >= 0:
             over[place] = False
             if measured[0]:
                 at = place * row_bytes
-                memory[at : at + state_bytes] = used_state
+                memory[at : at + state_bytes] = state_before
                 memory[at + state_bytes : at + row_bytes] = found
                 if not computed[0]:
                     failed.append(place)
-    for place in waiting:
-        compute_without(place)
-    table[over, ends[-2] :] = nan
-    table[failed, ends[-2] :] = nan
-    return [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)], over
+    missed = np.flatnonzero(over)
+    columns = [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)]
+    _compute_missed(session, missed, dict(zip(names, columns[1:], strict=True)))
+    columns[-1][missed] = nan
+    columns[-1][failed] = nan
+    return columns, missed
+
+
+def _compute_missed(session: Session, missed: Integers, columns: dict[str, Array]) -> None:
+    """Compute ticks that only the plant has, from the state that the controller had after its last one before."""
+    logged = LoggedController(session)
+    logged.resume(0)
+    controller, plant = logged.controller, session.plant
+    controller.leave_out_law()
+    # a silent row repeats the levels of the frame before it, if no row between them is missing or left out
+    framed = np.maximum.accumulate(np.where(plant["sent_as"] == Sent.FRAME, np.arange(len(plant)), -1))
+    gaps = [gap.last_tick for gap in session.missing if gap.end == "plant" and gap.rows and gap.last_tick is not None]
+    gaps_before = np.searchsorted(sorted([*gaps, *(one.last_tick for one in session.unknown)]), plant["session_tick"])
+    framed[gaps_before[framed] != gaps_before] = -1
+    known = np.where(np.isnan(columns["q"][:, 0]), -1, np.arange(len(session.k)))
+    before, followed = np.maximum.accumulate(known), -1
+    for place in missed.tolist():
+        if (source := framed[session.at_plant[place]]) < 0:
+            continue
+        if before[place] != followed:
+            followed = before[place]
+            for name in ("q", "state_next"):
+                controller.last_valid[name][:] = memoryview(columns[name][followed].copy())
+        tick = int(session.k[place])
+        logged.change(tick)
+        controller.tick(plant["measurement"][source].tobytes(), tick)
+        if controller.outputs["measured"][0]:
+            for name, column in columns.items():
+                column[place] = controller.outputs[name]
 
 
 def _gains(session: Session, k: Integers) -> Array:
@@ -313,9 +312,10 @@ def _voltages(session: Session) -> Array:
     at, acted, wire = session.at_controller, session.acted, session.settings.wire
     volts = np.full((len(session.k), wire.actuators), nan)
     held, _ = commanded(session, wire, session.controller["sent_as"], session.controller["command"])
-    answers = _is(session.controller, at, "sent_as", Sent.FRAME, Sent.SILENT)
+    answers = np.isin(_column(session.controller, at, "sent_as"), (Sent.FRAME, Sent.SILENT))
     volts[answers] = held[at[answers]]
-    others = (at < 0) & _is(session.plant, acted, "received_as", Sent.FRAME)  # the controller's rows are missing
+    # where the controller's rows are missing
+    others = (at < 0) & (_column(session.plant, acted, "received_as") == Sent.FRAME)
     volts[others] = levels(wire.voltage, codes_in(wire.command, session.plant["command"][acted[others]]))
     return volts
 
@@ -388,22 +388,17 @@ def clock_offset(forward: Array, backward: Array) -> Array:
     difference of the medians stays in both delays, with opposite signs. Shapes (n,), NaN where a time is unknown.
     """
     found, last_ns = np.empty(len(forward)), nan
-    edges = [*range(0, max(1, len(forward) - WINDOW // 2), WINDOW), len(forward)]
-    for begin, end in pairwise(edges):
-        found[begin:end] = last_ns
-        there, back = forward[begin:end], backward[begin:end]
-        known = np.flatnonzero(~np.isnan(there + back))
+    for part in np.array_split(np.arange(len(forward)), max(1, round(len(forward) / WINDOW))):
+        found[part] = last_ns
+        known = part[~np.isnan(forward[part] + backward[part])]
         if len(known) >= _LEAST:
-            # Differences to a base are small; products of times since boot would exceed a double's digits.
-            base = there[known[0]]
-            trip = (there - base) + (back + base)
-            quick = known[trip[known] <= np.median(trip[known])]
-            offset = ((there - base) - (back + base))[quick] / 2
-            apart, middle = quick - quick.mean(), offset.mean()
-            spread = float(apart @ apart) if quick[-1] - quick[0] >= WINDOW // 4 else 0.0
-            slope = float(apart @ (offset - middle)) / spread if spread else 0.0
-            found[begin:end] = base + middle + slope * (np.arange(end - begin) - quick.mean())
-            last_ns = float(found[end - 1])
+            base = forward[known[0]]  # differences to it are small; times since boot would exceed a double's digits
+            there, back = forward[known] - base, backward[known] + base
+            quick = there + back <= np.median(there + back)
+            at, offset = known[quick] - part[0], (there - back)[quick] / 2
+            fit = np.polyfit(at, offset, 1 if at[-1] - at[0] >= WINDOW // 4 else 0)
+            found[part] = base + np.polyval(fit, part - part[0])
+            last_ns = found[part[-1]]
     return found
 
 
@@ -412,35 +407,33 @@ def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, t
 
     In lockstep the plant waits for each command, so no duration is a loop's.
     """
-    rows, plant, at, at_plant = session.controller, session.plant, session.at_controller, session.at_plant
-    sent = _times(plant, at_plant, "sent", _is(plant, at_plant, "sent_as", Sent.FRAME))
+    rows, plant, at, at_plant, acted = (
+        session.controller, session.plant, session.at_controller, session.at_plant, session.acted
+    )  # fmt: skip
+    sent = _column(plant, at_plant, "sent")
     wall = np.where(
         at_plant >= 0,
-        _times(plant, at_plant, "sent") + _times(plant, at_plant, "wall"),
-        _times(rows, at, "received") + _times(rows, at, "wall"),
+        sent + _column(plant, at_plant, "wall"),
+        _column(rows, at, "received") + _column(rows, at, "wall"),
     )
+    sent[_column(plant, at_plant, "sent_as") != Sent.FRAME] = -1
     if session.settings.loop.lockstep:
         unknown = np.broadcast_to(np.float64(nan), len(session.k))
         return wall, sent, unknown, unknown, unknown, (nan, nan)
-    acted = _times(plant, session.acted, "received", _is(plant, session.acted, "received_as", Sent.FRAME))
-    received = _times(rows, at, "received", _is(rows, at, "received_as", Received.FRAME))
-    forward, backward = _since(sent, received), _since(_times(rows, at, "sent"), acted)
+    answered = np.where(_column(plant, acted, "received_as") == Sent.FRAME, _column(plant, acted, "received"), -1)
+    received = np.where(_column(rows, at, "received_as") == Received.FRAME, _column(rows, at, "received"), -1)
+    forward, backward = _since(sent, received), _since(_column(rows, at, "sent"), answered)
     offset = clock_offset(forward, backward)
     known = offset[~np.isnan(offset)]
     ends = (float(known[0]), float(known[-1])) if len(known) else (nan, nan)
-    return wall, sent, _since(sent, acted), forward - offset, backward + offset, ends
+    return wall, sent, _since(sent, answered), forward - offset, backward + offset, ends
 
 
-def _times(table: Table, at: Places, name: str, known: Flags | None = None) -> Integers:
-    """A column's values at places of a table; −1 where the place is −1 or the time is not known. Shape (n,)."""
-    if not len(table):
-        return np.full(len(at), -1)
-    return np.where((at >= 0) if known is None else known, table[name][at], -1)
-
-
-def _is(table: Table, at: Places, name: str, *kinds: int) -> Flags:
-    """Whether a column's value at places of a table is one of these; false where the place is −1. Shape (n,)."""
-    return np.isin(table[name][at], kinds) & (at >= 0) if len(table) else np.zeros(len(at), dtype=np.bool_)
+def _column(table: Table, places: Places, name: str) -> npt.NDArray[Any]:
+    """A column's values at places of a table; −1 where the place is −1. Shape (n,)."""
+    values = table[name]
+    kind = np.int16 if values.itemsize == 1 else np.int64
+    return np.append(values.astype(kind), kind(-1))[places]
 
 
 def _since(begin: Integers, end: Integers) -> Array:

@@ -11,7 +11,6 @@ takes what caches still hold.
 
 from __future__ import annotations
 
-import ctypes
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
@@ -29,23 +28,14 @@ from aeroloop.service.viewers.schemas import Decoded
 if TYPE_CHECKING:
     from aeroloop.service.viewers.channels import Decoder
 
-WORK_EVERY_S: Final = 0.5
-"""Messages can wait: a chunk is closed only once a second."""
-
+WORK_EVERY_S: Final = 0.5  # messages can wait: a chunk is closed only once a second
 STATUS_EVERY_S: Final = 1.0
-
-AT_ONCE: Final = 2000
-"""Messages written before anything else is done: the service manager expects a status."""
+AT_ONCE: Final = 2000  # messages written before anything else is done: the service manager expects a status
+END_S: Final = 8.0  # longest time for what caches hold when recording ends; a service manager kills after 10
 
 WAITING_BYTES: Final = 200_000_000
 """Of messages that wait while the disk refuses, with `OVERHEAD` for each; the newest that find no room are lost."""
 OVERHEAD: Final = 600
-
-_malloc_trim: Final = getattr(ctypes.CDLL(None), "malloc_trim", None)
-"""Gives freed memory back to the system, malloc_trim(3): after a flood, malloc would keep it. None without glibc."""
-
-END_S: Final = 8.0
-"""Longest time for what caches hold when recording ends [s]; a service manager kills after 10."""
 
 
 class Recorder:
@@ -55,7 +45,6 @@ class Recorder:
         self.log = RollingLog(settings, self._report)
         self.waiting: deque[tuple[Delivery, int]] = deque()  # taken and not yet written, with times of arrival
         self._role = role
-        self._subscribers: list[RecoveringSubscriber] = []
         self._waiting_bytes = 0
         self._refused: Counter[str] = Counter()  # messages for which there was no room, by key
         self._lost: Counter[LossReason] = Counter()
@@ -66,28 +55,27 @@ class Recorder:
         if settings.decoded_hz:
             try:
                 from aeroloop.service.viewers.channels import Decoder
+
+                self._decoder = Decoder(settings.decoded_hz)
             except ModuleNotFoundError:
                 role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
-            else:
-                self._decoder = Decoder(settings.decoded_hz)
+        self._subscribers = [RecoveringSubscriber(role.zenoh, topics.key(name, "*")) for name in topics.RECORDED]
 
     def run(self) -> None:
         """Record until the role's `stop` is set; then take what caches still hold and close the log."""
-        self._subscribers = [RecoveringSubscriber(self._role.zenoh, topics.key(name, "*")) for name in topics.RECORDED]
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
+        status_due, stopped = 0.0, False
         try:
-            status_due, stopped = 0.0, False
             while not stopped:
                 self._work()
                 if time.monotonic() >= status_due:
                     self._publish_losses(self._losses())
                     self._publish_status()
-                    if _malloc_trim is not None:
-                        _malloc_trim(0)
                     status_due = time.monotonic() + STATUS_EVERY_S
                 self.log.tend()
-                stopped = self._role.stop.wait(self._pause_s())
+                pause_s = WORK_EVERY_S if self._complete() else SOON_S
+                stopped = self._role.stop.wait(0.0 if self._behind else pause_s)
         finally:
             self._end()
 
@@ -98,11 +86,12 @@ class Recorder:
             self._work()
             time.sleep(0.0 if self._behind else SOON_S)
         self.log.tend(at_once=True)
-        ages = {key: age_s for each in self._subscribers for key, age_s in each.silent().items() if "/trace/" in key}
-        for key, age_s in ages.items():
-            what = "what it has published since is not in the log"
-            self._unreachable.append(f"nothing of {key} was received for {age_s:.0f} s: {what}")
-            self._role.event("lost", self._unreachable[-1])
+        for subscriber in self._subscribers:
+            for key, age_s in subscriber.silent().items():
+                if "/trace/" in key:
+                    what = "what it has published since is not in the log"
+                    self._unreachable.append(f"nothing of {key} was received for {age_s:.0f} s: {what}")
+                    self._role.event("lost", self._unreachable[-1])
         losses = self._losses(finished=True)
         self._work_off()
         self._publish_losses(losses)
@@ -110,83 +99,73 @@ class Recorder:
         self._work_off()
         self.log.close(len(self.waiting))
 
+    # ── messages ──
+
     def _complete(self, since: float | None = None) -> bool:
         return all(subscriber.complete(since) for subscriber in self._subscribers)
-
-    def _losses(self, *, finished: bool = False) -> list[Loss]:
-        return [loss for each in self._subscribers for loss in each.losses(finished=finished)]
 
     @property
     def _behind(self) -> bool:
         """Whether messages wait and the disk accepts them."""
-        return self.log.writable and len(self.waiting) > 0
-
-    def _pause_s(self) -> float:
-        if self._behind:
-            return 0.0
-        return WORK_EVERY_S if self._complete() else SOON_S
+        return not self.log.trouble and len(self.waiting) > 0
 
     def _work(self) -> None:
-        """Take the received messages, unless older ones can be written first, and write."""
+        """Take the received messages, unless older ones can be written first, and write some of the oldest."""
         if not self._behind:
             self._take()
-        self._write()
+        self._write(AT_ONCE)
 
     def _work_off(self) -> None:
         self._take()
-        while self._behind:
-            self._write()
+        self._write(len(self.waiting))
 
     def _take(self) -> None:
         now_ns = time.time_ns()
         for subscriber in self._subscribers:
             for received in subscriber.take():
-                self._receive(received, now_ns)
+                address = topics.read_key(received.key)
+                if address is not None and address.topic.name == "description":
+                    self._configure(received)  # at once: other messages are decoded by it
+                size = len(received.payload) + OVERHEAD
+                if not self.log.trouble or self._waiting_bytes + size <= WAITING_BYTES:
+                    self.waiting.append((received, now_ns))
+                    self._waiting_bytes += size
+                else:
+                    self._refused[received.key] += 1
 
-    def _write(self) -> None:
-        """Write the oldest messages, at most `AT_ONCE`, unless the disk refuses."""
-        for _ in range(AT_ONCE):
+    def _write(self, most: int) -> None:
+        """Write the oldest messages, unless the disk refuses."""
+        for _ in range(most):
             if not self._behind:
-                break
+                return
             received, at_ns = self.waiting.popleft()
             self._waiting_bytes -= len(received.payload) + OVERHEAD
-            self.log.add(received, at_ns, self._decode(received, at_ns))
+            address, decoded = topics.read_key(received.key), list[Decoded]()
+            if self._decoder is not None and address is not None:
+                decoded = self._decoder.take(address, received.payload, received.published_ns)
+            self.log.add(received, at_ns, decoded)
 
-    def _receive(self, received: Delivery, at_ns: int) -> None:
-        address = topics.read_key(received.key)
-        if address is not None and address.topic.name == "description":
-            self._configure(received, at_ns)  # at once: other messages are decoded by it
-        size = len(received.payload) + OVERHEAD
-        if self.log.writable or self._waiting_bytes + size <= WAITING_BYTES:
-            self.waiting.append((received, at_ns))
-            self._waiting_bytes += size
-        else:
-            self._refused[received.key] += 1
-
-    def _configure(self, received: Delivery, at_ns: int) -> None:
-        published_ns = received.published_ns or at_ns
-        if published_ns < self._described.get(received.key, 0):
+    def _configure(self, received: Delivery) -> None:
+        if received.published_ns < self._described.get(received.key, 0):
             return  # recovered after a newer one
         try:
             description = Description.decode(received.payload)
         except MessageError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
-        self._described[received.key] = published_ns
+        self._described[received.key] = received.published_ns
         self.log.add_description(received.key, received.payload)
         if self._decoder is not None:
             self._decoder.configure(description)
 
-    def _decode(self, received: Delivery, at_ns: int) -> list[Decoded]:
-        address = topics.read_key(received.key)
-        if self._decoder is None or address is None:
-            return []
-        published_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
-        return self._decoder.take(address, received.payload, published_ns)
+    # ── reports ──
+
+    def _losses(self, *, finished: bool = False) -> list[Loss]:
+        return [loss for each in self._subscribers for loss in each.losses(finished=finished)]
 
     def _publish_losses(self, losses: list[Loss]) -> None:
         """Publish, and thereby record, losses; those of the disk once it accepts writes again."""
-        if self.log.writable:
+        if not self.log.trouble:
             losses += [Loss(key=key, count=count, reason="disk") for key, count in self._refused.items()]
             self._refused.clear()
         for loss in losses:
@@ -207,7 +186,7 @@ class Recorder:
         notes += self._unreachable
         if self.log.trouble:
             notes.append(f"{len(self.waiting)} messages wait in memory")
-        state = STOPPED if self._role.stop.is_set() else "recording" if self.log.writable else NOT_RECORDING
+        state = STOPPED if self._role.stop.is_set() else NOT_RECORDING if self.log.trouble else "recording"
         rate_hz = (written - self._status_written) / max(now - self._status_at, 1e-3)
         self._role.status(Status(
             role=self._role.role, state=state, cause=self.log.trouble or None, uptime_s=self._role.uptime_s, ticks=0,

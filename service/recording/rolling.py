@@ -1,7 +1,7 @@
 """Rolling log: the files of a run, one after another, on a disk that may be full.
 
 A file is closed at a size or an age. The next one begins with the descriptions, which a reader of it alone needs. When
-the disk refuses, nothing is dropped here: `writable` turns false, the caller keeps its messages, and `tend` tries again
+the disk refuses, nothing is dropped here: `trouble` says why, the caller keeps its messages, and `tend` tries again
 every second: on a full disk in the same file, after any other error in a new one.
 """
 
@@ -29,6 +29,7 @@ RETRY_S: Final = 1.0
 REMIND_S: Final = 60.0
 """How often a fault that lasts is reported again [s]."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_BY_TIME: Final = "aeroloop-%Y%m%d-%H%M%S.mcap"
 
 
 class RecorderError(AeroloopError):
@@ -56,21 +57,26 @@ class RollingLog:
     """A log in files. Raises RecorderError if the first cannot be created.
 
     `report` is called with one line on the state of the disk, and whether it is a fault. `written` counts messages,
-    `trouble` is why nothing can be written now; empty if it can.
+    `trouble` is why nothing can be written now; empty if it can. `clock` is monotonic [s].
     """
 
-    def __init__(self, settings: RecorderSettings, report: Callable[[str, bool], None]) -> None:
+    def __init__(
+        self,
+        settings: RecorderSettings,
+        report: Callable[[str, bool], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.settings = settings
         self.written = 0
         self.trouble = ""
-        self._report = report
+        self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
         place = settings.path or settings.directory
-        self._base = log_path(place, "aeroloop-%Y%m%d-%H%M%S.mcap")
-        self._named_by_time = self._base != place
+        self._base = log_path(place, _BY_TIME)
+        self._runs = re.escape(self._base.stem) if self._base == place else r"aeroloop-\d{8}-\d{6}"  # that are ours
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
-        self._part = 0  # of the next file
+        self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
         self._due = self._remind_due = self._begun = 0.0
         self._broken = False  # whether the file cannot be used any more
         try:
@@ -87,18 +93,12 @@ class RollingLog:
         """The current file."""
         return self._file.path
 
-    @property
-    def writable(self) -> bool:
-        """Whether messages can be added."""
-        return not self.trouble
-
     def add(self, received: Delivery, at_ns: int, decoded: list[Decoded]) -> None:
-        """Add a message received at `at_ns` [ns since 1970] and its decoded ones; only while `writable`."""
+        """Add a message received at `at_ns` [ns since 1970] and its decoded ones; only without `trouble`."""
         self._unwritten.append((received, at_ns, decoded))
         self.written += 1
-        self._file.add(received, at_ns, decoded)
-        if self._file.full:
-            self._commit()
+        if self._file.add(received, at_ns, decoded):
+            self._write()
 
     def add_description(self, key: str, payload: bytes) -> None:
         """Put a role's description into this file and all later ones."""
@@ -107,13 +107,11 @@ class RollingLog:
             self._file.add_description(key, payload)
 
     def tend(self, *, at_once: bool = False) -> None:
-        """Do what is due: close a chunk, retry the disk, begin a new file. If `at_once`, retry before it is due."""
-        now = time.monotonic()
+        """Do what is due: write the chunk, retry the disk, begin a new file. If `at_once`, retry before it is due."""
+        now = self._clock()
         if now >= self._due or (at_once and self.trouble):
-            self._commit()
-            if not self.trouble:
-                self._due = now + self.settings.chunk_s  # whatever chunks were full meanwhile
-                self._rotate_when_due(now)
+            self._due = now + self.settings.chunk_s
+            self._write()
 
     def close(self, waiting: int = 0) -> None:
         """Write the rest and the index, and close the file; `waiting` messages were not added: the disk refused.
@@ -122,6 +120,8 @@ class RollingLog:
             RecorderError: Not all could be written; all written before is whole.
         """
         try:
+            if self._file.replaced:
+                self._next_file()
             self._file.commit()
             self._unwritten.clear()
             self._end(self._file)
@@ -136,62 +136,56 @@ class RollingLog:
         if waiting:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
-    def _commit(self) -> None:
-        """Write the chunk, into a new file if this one is broken or gone."""
+    def _write(self) -> None:
+        """Write the chunk, into a new file if this one is gone or broken; begin the next file if that is due."""
+        now, last, gone = self._clock(), self.path, self._file.replaced
         try:
-            if self.trouble and (self._broken or self._file.replaced):
+            if gone or self._broken:
                 self._next_file()
             else:
                 self._file.commit()
+                self._unwritten.clear()
         except OSError as error:
-            self._refused(error)
+            self._due = now + RETRY_S
+            self._broken |= error.errno not in FULL
+            if not self.trouble or now >= self._remind_due:
+                self.trouble = f"{last} cannot be written: {error.strerror}"
+                self._remind(f"{self.trouble}; messages are kept in memory and written when it can be")
             return
-        self._unwritten.clear()
         if self.trouble:
             self.trouble, self._broken = "", False
             self._report(f"recording again to {self.path}", False)
-
-    def _refused(self, error: OSError) -> None:
-        now = time.monotonic()
-        self._due = now + RETRY_S
-        self._broken |= error.errno not in FULL
-        if not self.trouble or now >= self._remind_due:
-            self.trouble = f"{self.path} cannot be written: {error.strerror}"
-            self._remind(f"{self.trouble}; messages are kept in memory and written when it can be")
+        elif gone:
+            self._report(f"{last} was moved or removed while it was written", True)
+        if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= self.settings.max_file_s:
+            try:
+                self._next_file()
+            except OSError as error:
+                if now >= self._remind_due:  # a file that is too large is better than none
+                    self._remind(f"no new file can be begun ({error.strerror}), so {last} goes on")
 
     def _remind(self, text: str) -> None:
-        self._remind_due = time.monotonic() + REMIND_S
+        self._remind_due = self._clock() + REMIND_S
         self._report(text, True)
 
-    def _rotate_when_due(self, now: float) -> None:
-        settings, last = self.settings, self._file
-        replaced = last.replaced
-        if not replaced and last.size < settings.max_file_mb * 1e6 and now - self._begun < settings.max_file_s:
-            return
-        try:
-            self._next_file()
-        except OSError as error:
-            if replaced:  # what is written to it now would be gone
-                self._refused(error)
-            elif now >= self._remind_due:  # a file that is too large is better than none
-                self._remind(f"no new file can be begun ({error.strerror}), so {self.path} goes on")
-            return
-        if replaced:
-            self._report(f"{last.path} was moved or removed while it was written", True)
-        self._remove_oldest()
-
     def _next_file(self) -> None:
-        """Begin a new file with what the last one has not written, and close that. Raises OSError if none can be."""
-        last, self._file = self._file, self._begin()
-        if self._unwritten:
-            last.abandon()
-            return
+        """Begin a new file with what is unwritten, and close the last one. Raises OSError if none can be begun.
+
+        The last one gets what is unwritten, too, if it takes it: where it was moved to, it is whole.
+        """
+        last = self._file
+        if last.removed:
+            last.abandon()  # while it is open, it takes its room from a disk that may be full
+        self._file = self._begin()
+        self._unwritten.clear()
         try:
-            self._end(last)
+            if not last.removed:
+                self._end(last)
         except OSError as error:
             last.abandon()
             what = f"the index of {last.path} could not be written: {error.strerror}"
             self._report(f"{what}; `aeroloop log recover` gives it one", True)
+        self._remove_oldest()
 
     def _end(self, file: LogFile) -> None:
         """Put the descriptions at the file's end, too, and close it. Raises OSError.
@@ -203,8 +197,11 @@ class RollingLog:
         file.end()
 
     def _begin(self) -> LogFile:
-        """Create the next file and write its head and what is unwritten. Raises OSError."""
-        path = self._next_path()
+        """Create a file under the next unused name; write its head and what is unwritten. Raises OSError."""
+        path, part = self._base, 0
+        while part < self._parts or path.exists():
+            part += 1
+            path = self._base.with_stem(f"{self._base.stem}-{part:04}")
         file = LogFile(path)
         try:
             started = datetime.now(UTC)
@@ -218,39 +215,28 @@ class RollingLog:
                 file.add(*entry)
             file.commit()
         except OSError:
-            file.remove()
-            raise
-        self._begun = time.monotonic()
-        self._part += 1  # a run uses no number twice, even if the file is removed
-        return file
-
-    def _next_path(self) -> Path:
-        """The next unused name; the base's own is the first."""
-        while True:
-            part = self._part
-            path = self._base.with_stem(f"{self._base.stem}-{part:04}") if part else self._base
-            if not path.exists():
-                return path
-            self._part += 1
-
-    def _remove_oldest(self) -> None:
-        """Remove the oldest files while all together are too large; never the current one."""
-        if self.settings.keep_gb is None:
-            return
-        found = []
-        for path in self._base.parent.glob("*.mcap"):
-            if path != self.path and self._is_own(path):
-                with suppress(OSError):
-                    stat = path.stat()
-                    found.append((stat.st_mtime_ns, stat.st_size, path))
-        room = self.settings.keep_gb * 1e9 - self._file.size - sum(size for _, size, _ in found)
-        for _, size, path in sorted(found):
-            if room >= 0:
-                return
+            file.abandon()
             with suppress(OSError):
                 path.unlink()
-                room += size
-                self._report(f"removed {path}, the oldest, to keep logs under {self.settings.keep_gb:g} GB", False)
+            raise
+        self._begun, self._parts = self._clock(), part + 1
+        return file
+
+    def _remove_oldest(self) -> None:
+        """Remove the oldest files while all together are too large; never the current one, nor another's."""
+        if (keep_gb := self.settings.keep_gb) is None:
+            return
+        with suppress(OSError):  # a file is gone; the others are removed next time
+            others = [path for path in self._base.parent.glob("*.mcap") if path != self.path and self._is_own(path)]
+            stats = sorted((path.stat().st_mtime_ns, path.stat().st_size, path) for path in others)
+            room = keep_gb * 1e9 - self._file.size - sum(size for _, size, _ in stats)
+            for _, size, path in stats:
+                if room >= 0:
+                    return
+                with suppress(OSError):
+                    path.unlink()
+                    room += size
+                    self._report(f"removed {path}, the oldest, to keep logs under {keep_gb:g} GB", False)
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file's metadata name this run or, if runs are named by the time, any run so named."""
@@ -258,6 +244,5 @@ class RollingLog:
             head = opening(path)
             if head is not None and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                runs = r"aeroloop-\d{8}-\d{6}" if self._named_by_time else re.escape(self._base.stem)
-                return run["part"] == path.stem and re.fullmatch(runs, run["run"]) is not None
+                return run["part"] == path.stem and re.fullmatch(self._runs, run["run"]) is not None
         return False

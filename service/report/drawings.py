@@ -33,12 +33,10 @@ NO_COUNT: Final = 0.5
 INK: Final = {"color": "var(--ink)", "size": 12}
 GRID: Final = {"gridcolor": "var(--grid)", "exponentformat": "power", "fixedrange": True}
 LAYOUT: Final = {
-    "paper_bgcolor": "rgba(0,0,0,0)",
-    "plot_bgcolor": "rgba(0,0,0,0)",
-    "font": {"size": 12, "color": "var(--quiet)"},
+    "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "font": {"size": 12, "color": "var(--quiet)"},
     "showlegend": False,
     "hoverlabel": {"bgcolor": "var(--raised)", "bordercolor": "var(--rule)", "font": INK, "namelength": -1},
-}
+}  # fmt: skip
 TIME_AXIS: Final = {
     "title": {"text": "time [s]", "standoff": 4}, "zeroline": False, "gridcolor": "var(--grid)",
     "linecolor": "var(--grid)", "showspikes": True, "spikemode": "across", "spikethickness": 1, "spikedash": "solid",
@@ -47,6 +45,8 @@ TIME_AXIS: Final = {
 }  # fmt: skip
 
 Json = dict[str, Any]
+Alike = list[tuple[int, Panel]]
+"""Panels with the same label, each with its run."""
 
 
 class Stroke(NamedTuple):
@@ -62,6 +62,11 @@ class Stroke(NamedTuple):
     swatch: str = ""
     run: int | None = None
     hover: str = ""
+
+    def trace(self, shape: str) -> Json:
+        """A line in this stroke; steps (`hv`) or straight from point to point (`linear`)."""
+        line = {"color": self.colour, "width": self.width, "dash": self.dash, "shape": shape}
+        return {"type": "scatter", "mode": "lines", "line": line}
 
 
 class Drawing(NamedTuple):
@@ -88,15 +93,9 @@ def drawings(reports: Sequence[Report]) -> Iterator[Drawing]:
     """Every drawing: distributions of durations, then the groups of panels in order."""
     had = {name for report in reports for name in report.findings.timing}
     yield from (_spread(name, reports) for name in SPREADS if name in had)
-    over_time = _shapes(reports), _band_labels(reports)
+    over_time = list(_shapes(reports)), _band_labels(reports)
     for group in dict.fromkeys(panel.group for report in reports for panel in report.panels):
         yield _group(group, reports, *over_time)
-
-
-def period_s(report: Report) -> float | None:
-    """The loop's period [s], as configured; None if the log does not have it."""
-    rate = report.settings.get("loop", {}).get("rate_hz")
-    return 1 / rate if isinstance(rate, int | float) and rate > 0 else None
 
 
 def typed(lines: Sequence[Array]) -> list[Any]:
@@ -111,7 +110,7 @@ def typed(lines: Sequence[Array]) -> list[Any]:
 
 def _group(group: str, reports: Sequence[Report], shapes: list[Json], labels: list[Json]) -> Drawing:
     """Panels of a group under each other; of several runs, those with the same label are overlaid."""
-    panels: dict[str, list[tuple[int, Panel]]] = {}
+    panels: dict[str, Alike] = {}
     for run, report in enumerate(reports):
         for panel in report.panels:
             if panel.group == group:
@@ -139,52 +138,51 @@ def _group(group: str, reports: Sequence[Report], shapes: list[Json], labels: li
             "xref": "paper", "x": 0, "xanchor": "left", "xshift": 2, "yref": f"y{axis} domain", "y": 1,
             "yanchor": "bottom", "borderpad": 0, "font": INK | {"size": 12.5},
         })  # fmt: skip
-        for run, nth, line in _lines(alike, reports, shared):
-            stroke = _stroke(line, nth, run, reports, shared)
+        for run, line, stroke in _strokes(alike, reports, shared):
             key[stroke.text if stroke.run is None else stroke.run] = line.desired, stroke
             name = f"{label} {stroke.hover or stroke.text}" if rows > 1 else stroke.hover or stroke.text
             values.append(line.values.astype(np.float32))
-            traces.append(_trace(stroke, "hv" if line.held and reports[run].thinned <= 2 else "linear") | {
+            traces.append(stroke.trace("hv" if line.held and reports[run].thinned <= 2 else "linear") | {
                 "times": run, "run": None if shared and line.desired else run, "yaxis": f"y{axis}",
                 "name": _plain(name), "hovertemplate": _plain(f"%{{y:.4~g}} {unit}"),
                 # A line that is published less often than every tick has no gaps between its values.
                 "connectgaps": bool(2 * np.isfinite(line.values).sum() < len(line.values)),
             })  # fmt: skip
     figure = {"data": [trace | {"y": y} for trace, y in zip(traces, typed(values), strict=True)], "layout": layout}
-    titles = dict.fromkeys(panel.title for alike in panels.values() for _, panel in alike)
-    timing = any(panel.unit in DURATIONS for alike in panels.values() for _, panel in alike)
+    of_group = [panel for alike in panels.values() for _, panel in alike]
     proved = group in PROVED and any(report.findings.theorem for report in reports)
+    timing = any(panel.unit in DURATIONS for panel in of_group)
     section = "timing" if timing else "theorem" if proved else "tracking"
-    entries = [stroke for desired in (False, True) for is_desired, stroke in key.values() if is_desired == desired]
-    shown = entries if len(reports) > 1 or len(entries) > 1 else []
-    return Drawing(group, " / ".join(titles), section, shown, figure, rows)
+    entries = [stroke for _, stroke in sorted(key.values(), key=lambda entry: entry[0])]  # desired ones last
+    title, shown = " / ".join(dict.fromkeys(panel.title for panel in of_group)), len(reports) > 1 or len(entries) > 1
+    return Drawing(group, title, section, entries if shown else [], figure, rows)
 
 
-def _lines(
-    alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool
-) -> Iterator[tuple[int, int, Line]]:
-    """Run, index within its kind, and line, desired ones first, under the others; of shared ones, the longest run's."""
+def _strokes(alike: Alike, reports: Sequence[Report], shared: bool) -> Iterator[tuple[int, Line, Stroke]]:
+    """Lines with their runs, desired ones first, under the others; of shared ones, the longest run's.
+
+    Colours mean measured, desired and true in one run, and the run among several.
+    """
     longest = max((run for run, _ in alike), key=lambda run: reports[run].findings.duration_s)
     for desired in (True, False):
         for run, panel in alike:
-            lines = [line for line in panel.lines if line.desired == desired]
-            if not (desired and shared) or run == longest:
-                yield from ((run, nth, line) for nth, line in enumerate(lines))
-
-
-def _stroke(line: Line, nth: int, run: int, reports: Sequence[Report], shared: bool) -> Stroke:
-    """Colours mean measured, desired and true in one run, and the run among several."""
-    if len(reports) == 1:
-        if line.desired:
-            return Stroke(line.label, "var(--desired)", 2.5)
-        colour = "var(--run-2)" if nth else "var(--run-0)"
-        return Stroke(line.label, colour, 1.1) if line.held else Stroke(line.label, colour, 1.1, "6px,4px", "dash")
-    if line.desired and shared:
-        return Stroke(line.label, "var(--quiet)", 2.5)
-    if line.desired or nth:
-        dash, swatch = ("1px,3px", "dot") if line.desired else ("5px,5px", "dash")
-        return Stroke(line.label, f"var(--run-{run % 8})", 1, dash, swatch, hover=f"{reports[run].name}, {line.label}")
-    return _run_stroke(run, reports)
+            if desired and shared and run != longest:
+                continue
+            for nth, line in enumerate(line for line in panel.lines if line.desired == desired):
+                if len(reports) > 1:
+                    stroke = _run_stroke(run, reports)
+                    if desired and shared:
+                        stroke = Stroke(line.label, "var(--quiet)", 2.5)
+                    elif desired or nth:
+                        dash, swatch = ("1px,3px", "dot") if desired else ("5px,5px", "dash")
+                        hover = f"{reports[run].name}, {line.label}"
+                        stroke = Stroke(line.label, stroke.colour, 1, dash, swatch, hover=hover)
+                elif desired:
+                    stroke = Stroke(line.label, "var(--desired)", 2.5)
+                else:
+                    dash, swatch = ("solid", "") if line.held else ("6px,4px", "dash")
+                    stroke = Stroke(line.label, "var(--run-2)" if nth else "var(--run-0)", 1.1, dash, swatch)
+                yield run, line, stroke
 
 
 def _run_stroke(run: int, reports: Sequence[Report]) -> Stroke:
@@ -194,12 +192,16 @@ def _run_stroke(run: int, reports: Sequence[Report]) -> Stroke:
     return Stroke(reports[run].name, f"var(--run-{run % 8})", width, DASHES[run % len(DASHES)], swatch, run)
 
 
-def _scale(alike: Sequence[tuple[int, Panel]], unit: str) -> Json:
+def _extent(alike: Alike) -> tuple[float, float]:
+    values = np.concatenate([line.values[np.isfinite(line.values)] for _, panel in alike for line in panel.lines])
+    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+
+
+def _scale(alike: Alike, unit: str) -> Json:
     """A value axis; durations that differ by more than a factor of 30 have a logarithmic one."""
     least, most = _extent(alike)
-    if unit in DURATIONS and least > 0 and most > 30 * least:
-        return _logarithmic(least, most)
-    return {"zerolinecolor": "var(--rule)"}
+    is_wide = unit in DURATIONS and least > 0 and most > 30 * least
+    return _logarithmic(least, most) if is_wide else {"zerolinecolor": "var(--rule)"}
 
 
 def _logarithmic(least: float, most: float) -> Json:
@@ -210,21 +212,16 @@ def _logarithmic(least: float, most: float) -> Json:
     return {"type": "log", "zeroline": False, "tickvals": values, "ticktext": [micros(value) for value in values]}
 
 
-def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> bool:
+def _desired_agree(alike: Alike, reports: Sequence[Report]) -> bool:
     """Whether the desired values of all runs are nowhere visibly apart, so that one line can stand for all."""
     desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
     visible = 0.02 * max(map(abs, _extent(alike)))
     for time, values in desired[1:]:
-        expected = np.interp(time, *desired[0], left=nan, right=nan) if len(desired[0][0]) else np.full(len(time), nan)
-        apart = np.abs(values - expected)
-        if not np.isfinite(apart).any() or np.nanmax(apart) > visible:
+        apart = np.abs(values - np.interp(time, *desired[0], left=nan, right=nan))
+        apart = apart[np.isfinite(apart)]
+        if not len(apart) or apart.max() > visible:
             return False
     return not desired or len(desired) == len(alike) == len(reports)
-
-
-def _extent(alike: Sequence[tuple[int, Panel]]) -> tuple[float, float]:
-    values = np.concatenate([line.values[np.isfinite(line.values)] for _, panel in alike for line in panel.lines])
-    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
 
 
 def _span(reports: Sequence[Report]) -> tuple[float, float]:
@@ -237,24 +234,24 @@ def _span(reports: Sequence[Report]) -> tuple[float, float]:
     return start - room, end + room
 
 
-def _shapes(reports: Sequence[Report]) -> list[Json]:
+def _shapes(reports: Sequence[Report]) -> Iterator[Json]:
     """Bands and gaps as areas across all panels, events as lines: one shape for all of a kind, as there may be many."""
-    shapes = []
+    across = {"type": "path", "yref": "paper", "layer": "below"}
     for run, report in enumerate(reports):
         own = f"var(--run-{run % 8})" if len(reports) > 1 else ""
-        period = period_s(report) or 0.0
-        gaps = [(gap.time_s, gap.time_s + gap.ticks * period) for gap in report.findings.gaps]
+        gaps = [(gap.time_s, gap.time_s + gap.ticks * (report.period_s or 0.0)) for gap in report.findings.gaps]
         bands = [(start, end) for start, end, _ in _bands(report)]
         for areas, colour in ((bands, own or "var(--run-4)"), (gaps, own or "var(--bad)")):
             path = " ".join(f"M{start:.10g},0 L{end:.10g},0 L{end:.10g},1 L{start:.10g},1 Z" for start, end in areas)
-            shapes.append({"run": run, "path": path, "opacity": 0.15, "fillcolor": colour, "line": {"width": 0}})
+            if path:
+                yield across | {"run": run, "path": path, "opacity": 0.15, "fillcolor": colour, "line": {"width": 0}}
         for kind, width, dash in (("mark", 1, "dot"), ("bad", 1.4, "solid")):
-            marks = (mark for mark in report.findings.marks if grave(mark) == (kind == "bad"))
-            times = sorted({mark.time_s for mark in marks if mark.time_s is not None})
-            path = " ".join(f"M{time:.10g},0 L{time:.10g},1" for time in times)
+            marks = [mark.time_s for mark in report.findings.marks if grave(mark) == (kind == "bad")]
+            times = sorted({time for time in marks if time is not None})
             line = {"color": own or f"var(--{kind})", "width": width, "dash": dash}
-            shapes.append({"run": run, "path": path, "opacity": max(0.2, 1 / (1 + len(times) / 60)), "line": line})
-    return [shape | {"type": "path", "yref": "paper", "layer": "below"} for shape in shapes if shape["path"]]
+            if times:
+                path, opacity = " ".join(f"M{time:.10g},0 L{time:.10g},1" for time in times), 1 / (1 + len(times) / 60)
+                yield across | {"run": run, "path": path, "opacity": max(0.2, opacity), "line": line}
 
 
 def _band_labels(reports: Sequence[Report]) -> list[Json]:
@@ -288,29 +285,24 @@ def _plain(text: str) -> str:
 
 def _spread(name: str, reports: Sequence[Report]) -> Drawing:
     """Histograms of a duration, with percentiles; bins without a count go down to the axis."""
-    several = len(reports) > 1
-    spreads = {
-        run: report.findings.timing[name] for run, report in enumerate(reports) if name in report.findings.timing
-    }
-    bins = [edge_and_count for spread in spreads.values() for edge_and_count in spread.bins] or [(1.0, 1)]
+    several, timings = len(reports) > 1, [report.findings.timing for report in reports]
+    spreads = {run: timing[name] for run, timing in enumerate(timings) if name in timing}
+    bins = [edge_and_count for spread in spreads.values() for edge_and_count in spread.bins]
     least, most, top = min(bins)[0], max(bins)[0] * 2 ** (1 / 16), max(count for _, count in bins)
     data, key, shapes, annotations = list[Json](), list[Stroke](), list[Json](), list[Json]()
     for run, spread in spreads.items():
         nth = np.rint([16 * log2(edge) for edge, _ in spread.bins]).astype(int)  # bins are 2^(1/16) wide
-        edges = np.arange(nth.min(initial=0) - 1, nth.max(initial=0) + 2)
+        edges = np.arange(nth.min() - 1, nth.max() + 2)
         counts = np.full(len(edges), NO_COUNT)
         counts[nth - edges[0]] = [count for _, count in spread.bins]
         stroke = _run_stroke(run, reports) if several else Stroke("", "var(--run-0)", 1)
         fill = {} if several else {"fill": "toself", "fillcolor": "var(--area)"}
-        data.append(
-            _trace(stroke, "hv") | fill | {"run": run, "x": 2 ** (edges / 16), "y": counts, "hoverinfo": "skip"}
-        )
         key.append(stroke)
+        data.append(stroke.trace("hv") | fill | {"run": run, "x": 2 ** (edges / 16), "y": counts, "hoverinfo": "skip"})
         for row, (percentile, at) in enumerate({"p50": spread.p50, "p99": spread.p99, "p99.9": spread.p999}.items()):
             line = {"color": stroke.colour if several else "var(--ink)", "width": 1, "dash": "dot"}
-            shapes.append(
-                {"run": run, "type": "line", "x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper", "line": line}
-            )
+            across = {"type": "line", "x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper", "line": line}
+            shapes.append({"run": run, **across})
             annotations.append({
                 "text": f"{percentile} {micros(at)}", "x": log10(at), "xanchor": "left", "xshift": 3, "font": INK,
                 "y": 1 - 0.1 * row, "yref": "paper", "yanchor": "top", "bgcolor": "var(--paper)", "showarrow": False,
@@ -322,11 +314,5 @@ def _spread(name: str, reports: Sequence[Report]) -> Drawing:
                          "range": [log10(NO_COUNT), log10(top) + 0.15]},
         "shapes": shapes, "annotations": [] if several else annotations,
     }  # fmt: skip
-    figure, title = {"data": data, "layout": layout}, SPREADS[name][1]
-    return Drawing(f"spread-{name}", title, "timing", key if several else [], figure)
-
-
-def _trace(stroke: Stroke, shape: str) -> Json:
-    """A line in a stroke; steps (`hv`) or straight from point to point (`linear`)."""
-    line = {"color": stroke.colour, "width": stroke.width, "dash": stroke.dash, "shape": shape}
-    return {"type": "scatter", "mode": "lines", "line": line}
+    figure = {"data": data, "layout": layout}
+    return Drawing(f"spread-{name}", SPREADS[name][1], "timing", key if several else [], figure)

@@ -37,8 +37,7 @@ function firstAt(instants, time) {
   let [low, high] = [0, instants.length];
   while (low < high) {
     const middle = (low + high) >> 1;
-    if (instants[middle] < time) low = middle + 1;
-    else high = middle;
+    [low, high] = instants[middle] < time ? [middle + 1, high] : [low, middle];
   }
   return low;
 }
@@ -59,7 +58,7 @@ function inView(x, y, pixels) {
       if (y[i] < y[low] || Number.isNaN(y[low])) low = i;
       if (y[i] > y[high] || Number.isNaN(y[high])) high = i;
     }
-    for (const at of low === high ? [low] : [Math.min(low, high), Math.max(low, high)]) drawn.x.push(x[at]), drawn.y.push(y[at]);
+    for (const at of new Set([Math.min(low, high), Math.max(low, high)])) drawn.x.push(x[at]), drawn.y.push(y[at]);
   }
   return drawn;
 }
@@ -113,13 +112,10 @@ function redraw() {
   refresh();
 }
 
-const watcher = new IntersectionObserver(
-  (changes) => {
-    for (const { target, isIntersecting } of changes) inSight[isIntersecting ? "add" : "delete"](target);
-    refresh();
-  },
-  { rootMargin: "400px" },
-);
+const watcher = new IntersectionObserver((changes) => {
+  for (const { target, isIntersecting } of changes) inSight[isIntersecting ? "add" : "delete"](target);
+  refresh();
+}, { rootMargin: "400px" });
 for (const figure of figures) watcher.observe(figure);
 
 // the time that is shown: moved by buttons, keys, drawings and links to instants
@@ -135,36 +131,29 @@ function showTime(from, to, marked = jumpedTo) {
   redraw();
 }
 
-/** Move by the name of a button or a key. */
+const quarters = { earlier: [-1, -1], later: [1, 1], in: [1, -1], out: [-2, 2] }; // of what is shown
+const keys = { ArrowLeft: "earlier", ArrowRight: "later", "+": "in", "=": "in", "-": "out", 0: "whole", Home: "whole" };
+
+/** Move by the name of a button. */
 function moveTime(how) {
-  const [from, to] = shown;
-  const quarter = (to - from) / 4;
   if (how === "whole") showTime(...span, null);
-  if (how === "earlier") showTime(from - quarter, to - quarter);
-  if (how === "later") showTime(from + quarter, to + quarter);
-  if (how === "in") showTime(from + quarter, to - quarter);
-  if (how === "out") showTime(from - 2 * quarter, to + 2 * quarter);
+  else showTime(...shown.map((time, i) => time + (quarters[how][i] * (shown[1] - shown[0])) / 4));
 }
 
-const moves = { ArrowLeft: "earlier", ArrowRight: "later", "+": "in", "=": "in", "-": "out", 0: "whole", Home: "whole" };
-
 document.addEventListener("keydown", (event) => {
-  const isMove = moves[event.key] && event.target.matches(".group .plot");
+  const isMove = keys[event.key] && event.target.matches(".group .plot");
   if (!isMove || event.ctrlKey || event.metaKey || event.altKey) return;
   event.preventDefault();
-  moveTime(moves[event.key]);
+  moveTime(keys[event.key]);
 });
 
 document.addEventListener("click", ({ target }) => {
-  const button = target.closest("[data-move], [data-time], [data-run]");
-  if (!button) return;
-  const { move, time, run } = button.dataset;
+  const { move, time, run } = target.closest("[data-move], [data-time], [data-run]")?.dataset ?? {};
   if (move) moveTime(move);
   if (time) {
     const half = Math.min((span[1] - span[0]) / 2, Math.max(0.5, (span[1] - span[0]) / 50));
     showTime(Number(time) - half, Number(time) + half, Number(time));
-    const isCalm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    document.getElementById("tracking").scrollIntoView({ behavior: isCalm ? "auto" : "smooth" });
+    document.getElementById("tracking").scrollIntoView();
   }
   if (run) {
     hiddenRuns[hiddenRuns.has(Number(run)) ? "delete" : "add"](Number(run));
@@ -180,29 +169,17 @@ moveTime("whole");
 const prefersDark = matchMedia("(prefers-color-scheme: dark)");
 const root = document.documentElement.style;
 let screenTheme = "";
-prefersDark.addEventListener("change", redraw);
-document.getElementById("theme").addEventListener("click", () => {
-  root.colorScheme = root.colorScheme ? "" : prefersDark.matches ? "light" : "dark";
+
+/** Change the theme: "light", "dark", or the system's. */
+function setTheme(theme) {
+  [screenTheme, root.colorScheme] = [root.colorScheme, theme];
   redraw();
-});
+}
+
+prefersDark.addEventListener("change", redraw);
+document.getElementById("theme").addEventListener("click", () => setTheme(root.colorScheme ? "" : prefersDark.matches ? "light" : "dark"));
 addEventListener("beforeprint", () => {
-  [screenTheme, root.colorScheme] = [root.colorScheme, "light"];
+  setTheme("light");
   figures.forEach(draw);
 });
-addEventListener("afterprint", () => {
-  root.colorScheme = screenTheme;
-  redraw();
-});
-
-// search among keys and values
-
-const search = document.getElementById("search");
-search.addEventListener("input", () => {
-  const wanted = search.value.trim().toLowerCase();
-  for (const table of document.querySelectorAll("details.keys")) {
-    const rows = [...table.querySelectorAll("[data-key]")];
-    for (const row of rows) row.hidden = !`${row.dataset.key} ${row.textContent}`.toLowerCase().includes(wanted);
-    table.hidden = rows.every((row) => row.hidden);
-    table.open = Boolean(wanted) && !table.hidden;
-  }
-});
+addEventListener("afterprint", () => setTheme(screenTheme));

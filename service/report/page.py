@@ -17,24 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from aeroloop.service.report.drawings import drawings, page_data, period_s
-from aeroloop.service.report.rows import (
-    PERCENTILES,
-    THEOREM,
-    count,
-    durations,
-    figure_rows,
-    grave,
-    micros,
-    missing,
-    percent,
-    seconds,
-    shown,
-    theorem_sentences,
-)
+from aeroloop.service.report import rows
+from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.review.report import Findings, Report, differences, flat
 
 Json = dict[str, Any]
+HERE = Path(__file__).parent
 
 
 def page(reports: Sequence[Report]) -> str:
@@ -43,41 +31,35 @@ def page(reports: Sequence[Report]) -> str:
         raise ValueError("a page needs a run")
     from plotly.offline import get_plotlyjs
 
-    folder = Path(__file__).parent
+    loader = FileSystemLoader(HERE)
     environment = Environment(
-        loader=FileSystemLoader(folder),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"seconds": seconds, "micros": micros, "percent": percent, "shown": shown, "count": count}
-    environment.tests |= {"grave": grave, "known": lambda row: any(value.number is not None for value in row.values)}
-    scripts = [get_plotlyjs(), (folder / "page.js").read_text(encoding="utf-8")]
+    environment.filters |= {each.__name__: each for each in (rows.seconds, rows.percent, rows.shown, rows.count)}
+    environment.filters["micros"] = rows.micros
+    environment.tests["grave"] = rows.grave
+    scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
     runs, drawn = [report.findings for report in reports], list(drawings(reports))
-    rows = figure_rows(runs)
     return environment.get_template("page.html").render(
         reports=reports,
         runs=list(enumerate(reports)),
         several=len(reports) > 1,
         policy=f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:",
-        style=(folder / "page.css").read_text(encoding="utf-8"),
+        style=(HERE / "page.css").read_text(encoding="utf-8"),
         scripts=scripts,
         data=page_data(reports, drawn),
         drawings=drawn,
-        rows=[row for row in rows if not row.figure.key.startswith(THEOREM)],
-        theorem_rows=[row for row in rows if row.figure.key.startswith(THEOREM)],
+        rows=rows.figure_rows(runs),
         differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),
-        missing=[missing(run) for run in runs],
-        theorem=[theorem_sentences(run) for run in runs],
-        durations=durations(runs),
-        percentiles=[f"{name}#" for name in PERCENTILES.values()],
+        missing=[rows.missing(run) for run in runs],
+        theorem=[rows.theorem_sentences(run) for run in runs],
+        durations=rows.durations(runs),
+        percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
         judgement=judgement,
         largest_error=largest_error,
-        period_s=period_s,
         thinned=max(reports, key=lambda report: report.thinned),
     )
 
@@ -95,28 +77,26 @@ class Judgement(NamedTuple):
 
 def judgement(run: Findings) -> Judgement:
     """Verdict by the limits of `--require`; without any, by trips and missing figures. It says if there were faults."""
-    found = _judgement(run)
+    limits = rows.count(len(run.checks), "limit")
+    if broken := sum(not check.holds for check in run.checks):
+        found = Judgement("Not held", False, f"{broken} of {limits} broken.")
+    elif run.checks:
+        found = Judgement("Held", True, f"{limits} required, none broken.")
+    elif run.z_track is None:
+        found = Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
+    elif run.trips:
+        times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
+        found = Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
+    else:
+        found = Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was required.")
     if not run.faults:
         return found
     changed: Counter[str] = Counter()
     for fault in run.faults:
         changed[fault.effect] += fault.changed
     counts = ", ".join(f"{n:,} {effect}" for effect, n in changed.items())
-    because = f"{found.because} {count(len(run.faults), 'fault')} acted at the plant: {counts}."
+    because = f"{found.because} {rows.count(len(run.faults), 'fault')} acted at the plant: {counts}."
     return Judgement(f"{found.word}, with faults", found.good, because)
-
-
-def _judgement(run: Findings) -> Judgement:
-    if broken := sum(not check.holds for check in run.checks):
-        return Judgement("Not held", False, f"{broken} of {count(len(run.checks), 'limit')} broken.")
-    if run.checks:
-        return Judgement("Held", True, f"{count(len(run.checks), 'limit')} required, none broken.")
-    if run.z_track is None:
-        return Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
-    if run.trips:
-        times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
-        return Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
-    return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was required.")
 
 
 def largest_error(report: Report) -> tuple[float, float] | None:

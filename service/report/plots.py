@@ -6,14 +6,16 @@ All quantities are drawn in every case; `NUMBERS` of review/panels.py has the pa
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, figure_style, save, stacked
+from aeroloop.service.report.figure_style import BLUE, GREEN, ORANGE, WIDTH_IN, figure_style, save
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
 
@@ -34,6 +36,10 @@ LETTERS: Final = {
 }  # fmt: skip
 """Quantized signals, in mathematics; with the index of the axis."""
 
+MEASURED: Final[dict[str, Any]] = {"color": BLUE, "linewidth": 0.7}
+DESIRED: Final[dict[str, Any]] = {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (3.5, 2.5))}
+TRUE: Final[dict[str, Any]] = {"color": GREEN, "linewidth": 0.9, "linestyle": (0, (1, 1))}
+
 DIGITS: Final = str.maketrans("₁₂₃", "123")
 
 
@@ -51,10 +57,15 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
             panels = [panel for group in groups for panel in report.panels if panel.group == group]
             if not panels:
                 continue
-            figure, axes = stacked(len(panels))
+            figure = Figure(figsize=(WIDTH_IN[1], 0.45 + 0.85 * len(panels)), layout="constrained")
+            axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0].tolist()
             for axis, panel in zip(axes, panels, strict=True):
                 _draw(axis, panel, report)
                 axis.set_ylabel(_label(panel, "^Q" if case != "continuous" else ""))
+                axis.margins(x=0)
+                axis.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+            axes[-1].set_xlabel("time [s]")
+            figure.align_ylabels(axes)
             for fault in report.findings.faults:
                 axes[0].annotate(
                     fault.fault, (fault.begin_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
@@ -66,7 +77,7 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
                     axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
             elif len(labels[0]) > 1:
                 figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
-            number = NUMBERS.get((name, case))
+            number = NUMBERS[case].get(name)
             paths += save(figure, folder, f"{number}-{name}" if number else name)
     return paths
 

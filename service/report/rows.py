@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from json import dumps
 from typing import Any, Final, Literal, NamedTuple
 
-from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
+from aeroloop.service.review.report import Findings, Mark, Spread
 from aeroloop.service.review.requirements import value_of
 
 
@@ -47,28 +47,27 @@ class Figure(NamedTuple):
     @property
     def key(self) -> str:
         """Its name in `--json`."""
-        return self.path if self.path.startswith(THEOREM) else self.path.partition(".")[0]
+        return self.path.partition(".")[0]
+
+    def delta(self, first: Value, value: Value, comparable: bool) -> Delta | None:
+        """Difference of a run's value to the first run's; None where either is unknown."""
+        if first.number is None or value.number is None:
+            return None
+        if first.text == value.text:
+            return Delta("0", "same")
+        apart = value.number - first.number
+        sign = "+" if apart > 0 else "−"
+        share = f" ({sign}{percent(abs(apart / first.number))} %)" if first.number else ""
+        word: Literal["better", "worse"] = "better" if apart < 0 else "worse"
+        return Delta(f"{sign}{self.text(abs(apart))}{share}", word if comparable else None)
 
 
 class Row(NamedTuple):
-    """A figure of several runs: a value per run, and whether less is better, run by run."""
+    """A figure of several runs: a value and its difference to the first one, run by run."""
 
     figure: Figure
     values: list[Value]
-    comparable: list[bool]
-
-    def delta(self, run: int) -> Delta | None:
-        """Difference of a run to the first; None where either is unknown."""
-        first, value = self.values[0].number, self.values[run].number
-        if first is None or value is None:
-            return None
-        if self.values[0].text == self.values[run].text:
-            return Delta("0", "same")
-        apart = value - first
-        sign = "+" if apart > 0 else "−"
-        share = f" ({sign}{percent(abs(apart / first))} %)" if first else ""
-        word: Literal["better", "worse"] = "better" if apart < 0 else "worse"
-        return Delta(f"{sign}{self.figure.text(abs(apart))}{share}", word if self.comparable[run] else None)
+    deltas: list[Delta | None]
 
 
 def micros(value: float) -> str:
@@ -92,9 +91,6 @@ def percent(share: float) -> str:
 
 _whole, _tenth, _hundredth = "{:,.0f}".format, "{:,.1f}".format, "{:,.2f}".format
 _fourth = "{:.4f}".format
-
-THEOREM: Final = "theorem."
-"""Prefix of the theorem's keys."""
 
 SPREADS: Final = {
     "latency": ("latency", "Latency: from a measurement to the command that answers it"),
@@ -123,6 +119,7 @@ FIGURES: Final = (
     Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
             "angle from measured to desired attitude"),
     Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
+    Figure("second_half_error_deg", "largest attitude error in the second half", "°", _hundredth),
     Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
     Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
     Figure("latency_us.p99", "loop latency p99", "µs", _whole),
@@ -143,33 +140,31 @@ FIGURES: Final = (
     Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
     Figure("trips", "trips", "", _whole, sums_up=True),
     Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
-    Figure("theorem.mean_square_share", "∫k‖z‖² of its bound V(t₀) + ∫δ_Q, at most", "%", percent),
     Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
-    Figure("theorem.radius", "bound of ‖z‖ in the long run, root mean square", "", _fourth, less_is_better=False),
     Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
     Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
-    Figure("theorem.z_norm", "largest ‖z‖ after the transient", "", _fourth),
-    Figure("theorem.true_z_norm", "largest true ‖z‖ after the transient", "", _fourth),
-    Figure("theorem.error_deg", "largest attitude error after the transient", "°", _hundredth),
-    Figure("theorem.true_error_deg", "largest true attitude error after the transient", "°", _hundredth),
     Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
     Figure("duration_s", "duration", "s", seconds, less_is_better=False),
 )  # fmt: skip
 
 
 def figure_rows(runs: Sequence[Findings]) -> list[Row]:
-    """Main figures, and every other that at least one run has or has a reason for lacking."""
+    """Main figures, and every other that at least one run has or has a reason for lacking.
+
+    Of the theorem's, `theorem_sentences` has the reasons.
+    """
     rows = []
-    apart = [abs(run.duration_s - runs[0].duration_s) > 0.01 * runs[0].duration_s for run in runs]
+    differ = [abs(run.duration_s - runs[0].duration_s) > 0.01 * runs[0].duration_s for run in runs]
     for figure in FIGURES:
-        found = [(run, value_of(run, figure.path)) for run in runs]
+        numbers = [value_of(run, figure.path) for run in runs]
         values = [
             Value("–", run.reasons.get(figure.key)) if number is None else Value(figure.text(number), None, number)
-            for run, number in found
+            for run, number in zip(runs, numbers, strict=True)
         ]
         if figure.main or any(value.text != "–" or value.why for value in values):
-            comparable = [figure.less_is_better and not (figure.sums_up and differ) for differ in apart]
-            rows.append(Row(figure, values, comparable))
+            comparable = [figure.less_is_better and not (figure.sums_up and apart) for apart in differ]
+            deltas = [figure.delta(values[0], value, may) for value, may in zip(values, comparable, strict=True)]
+            rows.append(Row(figure, values, deltas))
     return rows
 
 
@@ -208,52 +203,41 @@ def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
     """What is proven of a run and what of it held, with whether that is good; nothing if it was not checked."""
     if (found := run.theorem) is None:
         return []
-    counts = {
-        "Lemma 1": found.judged,
-        "the mean square": found.mean_square_judged,
-        "the bound at every instant": found.pointwise_judged,
-    }
-    by = ", ".join(name for name, n in counts.items() if n)
+    counts = {"Lemma 1": found.judged, "the bound at every instant": found.pointwise_judged}
+    by = " and ".join(name for name, n in counts.items() if n)
     held = {True: f"The run kept to {by}.", False: f"The run did not keep to all of {by}."}
-    told: list[tuple[bool | None, str]] = [
-        (bool(found.holds), found.verdict),
-        (found.held, "Nothing could be judged." if found.held is None else held[found.held]),
-        (None, _judged(found)),
-    ]
-    if found.mean_square_share is not None and found.spacing_s is not None:
-        text = (
-            f"∫k‖z‖² is at most {percent(found.mean_square_share)} % of V(t₀) + ∫δ_Q, at {found.mean_square_at_s:g} s"
-        )
-        told.append((None, f"{text}; {found.mean_square_judged:,} true states up to {found.spacing_s:g} s apart."))
+    judged = []
+    if found.since_s:
+        judged.append(f"Judged from {found.since_s:g} s, when the reference had been reached.")
+    if found.until_s is not None:
+        judged.append(f"Judged until {found.until_s:g} s, where gains or reference changed.")
+    if found.samples:
+        unmet = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
+        judged += [f"{found.samples:,} true states belong to a tick.", *unmet]
+        if found.judged:
+            judged.append(f"Lemma 1 is judged by {f'the other {found.judged:,}' if unmet else 'all of them'}.")
+    if found.broken:
+        which = ", ".join(f"({check.equation}) {check.broken:,}×" for check in found.lemma if check.broken)
+        judged.append(f"It is broken: {which}.")
+    elif found.lemma:
+        closest = max(found.lemma, key=lambda check: check.closest)
+        judged.append(f"Closest is ({closest.equation}), {percent(closest.closest)} % of its bound.")
     if found.pointwise_share is not None:
         text = f"‖z‖ is at most {percent(found.pointwise_share)} % of its bound, at {found.pointwise_at_s:g} s"
         since = f"the bound judges from {found.pointwise_since_s:g} s and falls to {found.pointwise_bound:.4g}"
-        told.append((None, f"{text}; {since}."))
-    names: dict[str, list[str]] = {}
-    for row in figure_rows([run]):
-        why = row.values[0].why
-        if row.figure.key.startswith(THEOREM) and why and why != found.verdict.rstrip("."):  # which is said already
-            names.setdefault(why, []).append(row.figure.name)
-    return told + [(None, f"Not judged, since {why}: {'; '.join(of)}.") for why, of in names.items()]
-
-
-def _judged(found: TheoremFindings) -> str:
-    """From when until when a run is judged, and by how many true states."""
-    parts = [f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower time constant."]
-    if found.since_s:
-        parts.append(f"Judged from {found.since_s:g} s, when the reference had been reached.")
-    if found.until_s is not None:
-        parts.append(f"Judged until {found.until_s:g} s, where gains or reference changed.")
-    if found.samples:
-        unmet = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
-        by = f"the other {found.judged:,}" if unmet else "all of them"
-        parts += [f"{found.samples:,} true states belong to a tick.", *unmet, f"Lemma 1 is judged by {by}."]
-    if found.broken:
-        which = ", ".join(f"({check.equation}) {check.broken:,}×" for check in found.lemma if check.broken)
-        parts.append(f"It is broken: {which}.")
-    elif closest := max((check.closest or 0.0, check.equation) for check in found.lemma) if found.judged else None:
-        parts.append(f"Closest is ({closest[1]}), {percent(closest[0])} % of its bound.")
-    return " ".join(parts)
+        judged.append(f"{text}; {since}.")
+    unjudged: dict[str, list[str]] = {}
+    for (name, n), key in zip(counts.items(), ("broken", "pointwise_share"), strict=True):
+        why = run.reasons.get(f"theorem.{key}")
+        if why and not n and why != found.verdict.rstrip("."):  # which is said already
+            unjudged.setdefault(why, []).append(name)
+    reasons = "; ".join(f"{' and '.join(names)}, since {why}" for why, names in unjudged.items())
+    texts = " ".join(judged), f"Not judged: {reasons}." if reasons else ""
+    return [
+        (bool(found.holds), found.verdict),
+        (found.held, "Nothing could be judged." if found.held is None else held[found.held]),
+        *((None, text) for text in texts if text),
+    ]
 
 
 def grave(mark: Mark) -> bool:

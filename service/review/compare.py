@@ -41,9 +41,9 @@ class Comparison(BaseModel, frozen=True):
 
 
 def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
-    """A report of every log or folder, each a run of its own, with names that differ, checked against limits.
+    """A report of every log or folder, each a run of its own, checked against limits. Raises as `read` does.
 
-    Logs of one name are named with their folders. Raises as `read` does.
+    Their names differ: logs of one name are named with their folders, and if that is not enough, by number.
     """
 
     def share(done: int) -> Progress | None:
@@ -51,20 +51,12 @@ def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Prog
 
     points = MAX_POINTS // len(logs)  # one page holds them all
     runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
-    names = [run.name for run in runs]
-    for i, log in enumerate(logs):
-        if names.count(names[i]) > 1:
-            runs[i] = replace(runs[i], name=f"{log.resolve().parent.name}/{names[i]}")
-    return named_apart(runs)
-
-
-def named_apart(reports: Sequence[Report]) -> list[Report]:
-    """Runs whose names differ: of several with one name, the second is `name (2)`."""
-    apart: dict[str, Report] = {}
-    for run in reports:
-        name, n = run.name, 1
-        while name in apart:
-            n += 1
-            name = f"{run.name} ({n})"
-        apart[name] = replace(run, name=name)
-    return list(apart.values())
+    alike = [run.name for run in runs]
+    names = [
+        name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"
+        for name, log in zip(alike, logs, strict=True)
+    ]
+    nth = [names[: i + 1].count(name) for i, name in enumerate(names)]
+    return [
+        replace(run, name=name if n == 1 else f"{name} ({n})") for run, name, n in zip(runs, names, nth, strict=True)
+    ]

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import LOSS_REASONS, Event, FaultStatus, Loss, Status
+from aeroloop.protocol.messages.models import LOSS_REASONS, Event, Loss, Status
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
@@ -29,7 +29,7 @@ from aeroloop.service.review.report import FaultInterval, Mark
 MAX_MARKS: Final = 300
 """Marks of a kind and role; one more stands for the rest."""
 
-_EVENTS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
+_MODELS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
 
 class Truths(NamedTuple):
@@ -70,10 +70,10 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
 
     def wanted(address: Address) -> Address | None:
         name = address.topic.name
-        return address if name in _EVENTS or (name == "truth" and address.vehicle == which[0]) else None
+        return address if name in _MODELS or (name == "truth" and address.vehicle == which[0]) else None
 
-    for found in recording.messages(wanted):
-        address, at_ns = found.answer, found.publish_time
+    for address, found in recording.messages(wanted):
+        at_ns = found.publish_time
         name = address.topic.name
         try:
             if name == "truth":
@@ -82,12 +82,9 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
                     states.extend((truth.session_tick, *truth.attitude, *truth.rate))
             elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
                 known.add(identity)
-                message = _EVENTS[name].model_validate_json(found.data)
-                if (
-                    isinstance(message, Status)
-                    and (age := message.age_us)
-                    and not isfinite(age.p50 + age.p99 + age.max)
-                ):
+                message = _MODELS[name].model_validate_json(found.data)
+                age = message.age_us if isinstance(message, Status) else None
+                if age is not None and not isfinite(age.p50 + age.p99 + age.max):
                     raise ValueError
                 if address.vehicle == which[0]:
                     published.append(Published(at_ns, address.role or "recorder", message))
@@ -114,7 +111,8 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
     """
     found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
     trips, losses = list[str](), Counter[str]()
-    (first, last), clocks, period = span, _Clocks(session), session.settings.loop.period
+    (first, last), latest = span, max(session.extent.last.values())
+    clocks, period = _Clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
         tick = shown = clocks.tick(role, at_ns)
         if isinstance(message, Event):
@@ -125,7 +123,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
                 trips.append(message.text)
             if of_session and message.tick is None:  # belongs to it, though published just before or after
                 shown = min(max(tick, first), last)
-            elif of_session and message.tick is not None and 0 <= message.tick <= max(session.extent.last.values()) + 1:
+            elif of_session and message.tick is not None and 0 <= message.tick <= latest + 1:
                 tick = shown = message.tick
             found[role, message.kind].append((tick, shown, message.text))
         elif isinstance(message, Loss):
@@ -171,35 +169,30 @@ def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]
     # The first status after the session has its final counts, if it is of the same process; likewise the one before.
     last = next((status for status in statuses[own[-1] + 1 :] if status.uptime_s >= last.uptime_s), last)
     before = [status for status in statuses[: own[0]][-1:] if status.uptime_s <= last.uptime_s]
-    changed = {_identity(fault): fault.changed for status in before for fault in status.faults}
+    changed = {(one.fault, one.source, one.begin_tick): one.changed for status in before for one in status.faults}
     first = int(session.plant["tick"][0]) - int(session.plant["session_tick"][0])
     ticks, period, found = int(session.k[-1]) + 1, session.settings.loop.period, list[FaultInterval]()
-    for fault in last.faults:
-        if fault.begin_tick is None:
+    for one in last.faults:
+        if one.begin_tick is None:
             continue
-        begin, end = max(0, fault.begin_tick - first), None if fault.end_tick is None else fault.end_tick - first
-        if begin >= ticks or (end is not None and end <= begin):
-            continue
-        found.append(
-            FaultInterval(
-                fault=fault.fault,
-                source=fault.source,
+        begin, end = max(0, one.begin_tick - first), inf if one.end_tick is None else one.end_tick - first
+        if begin < min(ticks, end):
+            interval = FaultInterval(
+                fault=one.fault,
+                source=one.source,
                 begin_s=round(begin * period, 9),
-                end_s=None if end is None or end >= ticks else round(end * period, 9),
-                changed=fault.changed - changed.get(_identity(fault), 0),
-                effect=fault.effect,
+                end_s=None if end >= ticks else round(end * period, 9),
+                changed=one.changed - changed.get((one.fault, one.source, one.begin_tick), 0),
+                effect=one.effect,
             )
-        )
+            found.append(interval)
     return sorted(found, key=lambda interval: interval.begin_s)
 
 
 def described(change: Change) -> str:
     """A change in words."""
-    parts = []
-    if change.gains is not None:
-        parts.append(
-            ", ".join(f"{name} = [{', '.join(f'{x:g}' for x in xs)}]" for name, xs in change.gains.named.items())
-        )
+    gains = change.gains.named if change.gains is not None else {}
+    parts = [", ".join(f"{name} = [{', '.join(f'{x:g}' for x in xs)}]" for name, xs in gains.items())] * bool(gains)
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")
@@ -244,7 +237,3 @@ class _Clocks:
         first, walls, ticks = clock
         within = min(max(at_ns - first, 0), int(walls[-1]))
         return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / self._period_ns
-
-
-def _identity(fault: FaultStatus) -> tuple[str, str, int | None]:
-    return fault.fault, fault.source, fault.begin_tick

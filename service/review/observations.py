@@ -6,7 +6,6 @@ from math import inf
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.protocol.wire.spec import WireSpec
@@ -35,9 +34,9 @@ def spread(nanoseconds: Array) -> Spread:
     """Distribution of at least one duration [ns]; under 1 µs counts as 1 µs. Shape (n,)."""
     us = np.clip(nanoseconds * 1e-3, *_BIN_EDGES_US[[0, -1]])
     counts, _ = np.histogram(us, _BIN_EDGES_US)
-    p50, p90, p99, p999 = np.percentile(us, [50, 90, 99, 99.9]).round(1).tolist()
+    p50, p90, p99, p999, most = np.percentile(us, [50, 90, 99, 99.9, 100]).round(1).tolist()
     bins = [(round(float(_BIN_EDGES_US[i]), 3), int(counts[i])) for i in np.flatnonzero(counts)]
-    return Spread(count=len(us), p50=p50, p90=p90, p99=p99, p999=p999, max=round(float(us.max()), 1), bins=bins)
+    return Spread(count=len(us), p50=p50, p90=p90, p99=p99, p999=p999, max=most, bins=bins)
 
 
 def periods_ns(ticks: Ticks) -> Array:
@@ -59,30 +58,29 @@ def gaps(answered: Integers, period: float) -> tuple[int, list[Gap]]:
 def saturation(wire: WireSpec, measurements: Codes, commands: Codes) -> tuple[dict[str, float], dict[str, int]]:
     """Share of each signal's values at its outermost level, and how many frames have a component without a valid value.
 
-    Args:
-        wire: The quantizers.
-        measurements: Codes of measurement frames. Shape (n, 6).
-        commands: Codes of command frames. Shape (m, actuators).
+    The codes are those of measurement frames, shape (n, 6), and of command frames, shape (m, actuators).
     """
     shares: dict[str, float] = {}
-    invalid: dict[str, NDArray[np.bool_]] = {}
-    for name, codes in (("attitude", measurements[:, :3]), ("rate", measurements[:, 3:]), ("voltage", commands)):
+    invalid = {"measurement": np.zeros(len(measurements), np.bool_), "command": np.zeros(len(commands), np.bool_)}
+    for name, frame, codes in (
+        ("attitude", "measurement", measurements[:, :3]),
+        ("rate", "measurement", measurements[:, 3:]),
+        ("voltage", "command", commands),
+    ):
         quantizer = getattr(wire, name).quantizer()
         wrong = np.isnan(codes) | (codes == quantizer.invalid)
-        outermost = (np.abs(codes) >= quantizer.encode(quantizer.limit)) & ~wrong
         if valid := int((~wrong).sum()):
+            outermost = (np.abs(codes) >= quantizer.encode(quantizer.limit)) & ~wrong
             shares[name] = int(outermost.sum()) / valid
-        invalid[name] = wrong.any(axis=1)
-    wrong_measurements = int((invalid["attitude"] | invalid["rate"]).sum())
-    return shares, {"measurement": wrong_measurements, "command": int(invalid["voltage"].sum())}
+        invalid[frame] |= wrong.any(axis=1)
+    return shares, {frame: int(where.sum()) for frame, where in invalid.items()}
 
 
 def lapses(session: Session, missed: Integers) -> dict[str, int]:
     """Deviations from one frame each way per tick, by kind; see `Findings.lapses`.
 
-    Args:
-        session: The session.
-        missed: Ticks that the plant measured and the controller did not compute, if its rows are not what is missing.
+    `missed` are ticks that the plant measured and the controller did not compute; those whose rows of the controller
+    the log lacks do not count.
     """
     for gap in session.missing:
         if gap.end == "controller" and gap.rows:
@@ -91,15 +89,15 @@ def lapses(session: Session, missed: Integers) -> dict[str, int]:
     ticks = np.maximum.accumulate(session.controller["tick"])  # a late row is of a lower one
     received_as = session.controller["received_as"][(ticks >= first) & (ticks <= last)]
     outcome = session.plant["outcome"][session.at_plant[session.at_plant >= 0]]
-    found = {
-        "late": np.isin(received_as, [Received.LATE]),
-        "malformed": np.isin(received_as, [Received.MALFORMED]),
-        "stale": np.isin(outcome, [Outcome.STALE]),
-        "repeated": np.isin(outcome, [Outcome.REPEATED]),
-        "refused": np.isin(outcome, [Outcome.MALFORMED, Outcome.INVALID]),
-        "withheld": np.isin(outcome, [Outcome.WITHHELD]),
+    counts = {
+        "late": int((received_as == Received.LATE).sum()),
+        "malformed": int((received_as == Received.MALFORMED).sum()),
+        "stale": int((outcome == Outcome.STALE).sum()),
+        "repeated": int((outcome == Outcome.REPEATED).sum()),
+        "refused": int(np.isin(outcome, [Outcome.MALFORMED, Outcome.INVALID]).sum()),
+        "withheld": int((outcome == Outcome.WITHHELD).sum()),
+        "missed": len(missed),
     }
-    counts = {name: int(where.sum()) for name, where in found.items()} | {"missed": len(missed)}
     return {name: count for name, count in counts.items() if count}
 
 

@@ -2,8 +2,8 @@
 
 A log is one run, and a run is one of the paper's three cases: without quantization (C.4–C.6), with it (C.7–C.11), with
 it and wind (C.12–C.14). Every quantity is drawn in every case; a title has the paper's number where the paper has
-that figure. Roll, pitch and yaw come before them; timing, estimates, and the theorem's norms follow. Every tick is
-drawn while there are few enough; of more, the least and the largest value of each bucket, so that no extreme is lost.
+that figure. Every tick is drawn while there are few enough; of more, the least and the largest value of each bucket, so
+that no extreme is lost.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Final, Literal
 import numpy as np
 
 from aeroloop.service.config import Settings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.session import Array, Integers
@@ -22,10 +23,13 @@ from aeroloop.service.logs.table import euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
-from aeroloop.service.review.theorem import TheoremCheck
+from aeroloop.service.review.theorem import TheoremCheck, signals
 
 MAX_POINTS: Final = 180_000
 """Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
+
+DESIRED: Final = ("desired", "bound")
+"""Beginnings of the names of lines that a run should follow, or stay below."""
 
 Case = Literal["continuous", "quantized", "wind"]
 
@@ -35,20 +39,12 @@ CASES: Final[dict[Case, str]] = {
     "wind": "with wind",
 }
 
-NUMBERS: Final[dict[tuple[str, Case], str]] = {
-    ("error", "continuous"): "C.4",
-    ("rate_error", "continuous"): "C.5",
-    ("input", "continuous"): "C.6",
-    ("attitude", "quantized"): "C.7",
-    ("rate", "quantized"): "C.8",
-    ("error", "quantized"): "C.9",
-    ("rate_error", "quantized"): "C.10",
-    ("input", "quantized"): "C.11",
-    ("error", "wind"): "C.12",
-    ("rate_error", "wind"): "C.13",
-    ("input", "wind"): "C.14",
+NUMBERS: Final[dict[Case, dict[str, str]]] = {
+    "continuous": {"error": "C.4", "rate_error": "C.5", "input": "C.6"},
+    "quantized": {"attitude": "C.7", "rate": "C.8", "error": "C.9", "rate_error": "C.10", "input": "C.11"},
+    "wind": {"error": "C.12", "rate_error": "C.13", "input": "C.14"},
 }
-"""Number of the paper's figure of a quantity in a case."""
+"""Number of the paper's figure of a quantity, by case."""
 
 _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
 """Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""
@@ -58,8 +54,8 @@ def case_of(settings: Settings) -> Case:
     """The paper's case that a session belongs to."""
     if settings.plant.wind.blowing and not settings.plant.ideal:
         return "wind"
-    bits = (settings.wire.attitude.bits, settings.wire.rate.bits, settings.wire.voltage.bits)
-    return "continuous" if bits == (None, None, None) else "quantized"
+    wire = settings.wire
+    return "quantized" if any(signal.bits for signal in (wire.attitude, wire.rate, wire.voltage)) else "continuous"
 
 
 def panels_of(
@@ -77,20 +73,18 @@ def panels_of(
         first, last = k[starts], k[np.append(starts[1:], n) - 1]
         quarter = np.maximum(0.0, ((last - first + 1) / 2 - 1) / 2)
         k = np.column_stack([first + quarter, last - quarter]).ravel()
-    time, panels = k * settings.loop.period, list[Panel]()
+    panels = list[Panel]()
     for group, title, labels, unit, lines in _quantities(settings, ticks, theorem):
         for i, label in enumerate(labels):
             columns = {name: values.reshape(n, -1)[:, i] for name, values in lines.items()}
             drawn = [
-                Line(name, column if starts is None else outline(column, starts), name == "desired")
+                Line(name, column if starts is None else outline(column, starts), name.startswith(DESIRED))
                 for name, column in columns.items()
                 if not np.isnan(column).all()
             ]
-            if group == "z_norm" and drawn:
-                drawn += _level(theorem, time)
             if drawn:
                 panels.append(Panel(group, title, label, unit, drawn))
-    return time, panels, 1 if starts is None else int(np.diff(starts, append=n).max())
+    return k * settings.loop.period, panels, 1 if starts is None else int(np.diff(starts, append=n).max())
 
 
 def outline(values: Array, starts: Integers) -> Array:
@@ -107,10 +101,10 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
     case, desired, error = case_of(settings), ticks.desired, ticks.attitude_error
 
     def title(name: str, quantity: str) -> str:
-        number = NUMBERS.get((name, case))
+        number = NUMBERS[case].get(name)
         return f"{f'Figure {number}: ' if number else ''}{quantity} {CASES[case]}"
 
-    def true_line(row: int) -> Array:
+    def true(row: int) -> Array:
         """A row of the true states: interpolated between them, for drawing only, and NaN before the first."""
         if not len(theorem.true_k):
             return np.full(len(ticks.k), np.nan)
@@ -118,7 +112,8 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
 
     angles = np.unwrap(euler_deg(desired), period=360.0, axis=0)
     measured, actual = (
-        _near(euler_deg(q), angles) for q in (ticks.attitude, np.column_stack([true_line(row) for row in range(3, 7)]))
+        angles + (euler_deg(q) - angles + 180.0) % 360.0 - 180.0  # ±360°, nearest to the desired angles
+        for q in (ticks.attitude, np.column_stack([true(row) for row in range(3, 7)]))
     )
     lines = {"measured": measured, "desired": angles, "true": actual}
     yield "angles", "Roll, pitch and yaw", ("roll", "pitch", "yaw"), "°", lines
@@ -131,40 +126,36 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
     yield "rate_error", title("rate_error", "Angular velocity error"), ("ω_e1", "ω_e2", "ω_e3"), "rad/s", lines
     inputs = ["u" + "₁₂₃₄₅₆₇₈"[i - 1] for i in settings.wire.motors]
     yield "input", title("input", "Input"), inputs, "V", {"commanded": ticks.voltages}
-    lines = {"measured": error_deg(error), "true": true_line(2)}
+    lines = {"measured": error_deg(error), "true": true(2)}
     yield "error_angle", "Attitude error, as an angle", ["angle"], "°", lines
     if not settings.loop.lockstep:
         yield "latency", "Loop latency", ["latency"], "µs", {"latency": ticks.latency_ns * 1e-3}
         yield "period", "Period between measurements", ["period"], "µs", {"period": periods_ns(ticks) * 1e-3}
-    yield from _law_state(settings, ticks)
-    yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", {"measured": theorem.norm, "true": true_line(0)}
-    name = "true, with θ̃" if theorem.findings.damping_known else "true, without θ̃"
-    yield "lyapunov", "Lyapunov function", ["V"], "N·m", {"measured, without θ̃": theorem.V, name: true_line(1)}
-
-
-def _law_state(settings: Settings, ticks: Ticks) -> Iterator[_Quantity]:
-    """Each part of the law's named state, in its order, but for the sign of the equilibrium."""
     law, at = law_of(settings.law, settings.loop.period, settings.wire.actuators), 0
     for name, values in initial_state(law).items():
-        if name != "sign":
+        if name != "sign":  # of the equilibrium
             symbol = {"damping_estimate": "θ̂"}.get(name, name)
             labels = [f"{symbol}{'₁₂₃₄₅₆₇₈₉'[i] if i < 9 else i + 1}" for i in range(len(values))]
-            state, title = ticks.state[:, at : at + len(values)], name.replace("_", " ").capitalize()
-            yield name, title, labels, law.units.get(name, "1"), {"estimated": state}
+            lines, unit = {"estimated": ticks.state[:, at : at + len(values)]}, law.units.get(name, "1")
+            yield name, name.replace("_", " ").capitalize(), labels, unit, lines
         at += len(values)
+    if isinstance(settings.law, AdaptiveSettings):
+        found, period = theorem.findings, settings.loop.period
+        until = inf if found.until_s is None else found.until_s / period
+        judged = (ticks.k >= found.since_s / period) & (ticks.k < until)
+        norm, V = _norm(ticks, settings.law)
+        lines = {"measured": norm, "true": true(0)}
+        if found.pointwise_radius is not None:
+            lines["bound, once within it"] = np.where(judged, found.pointwise_radius, np.nan)
+        yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", lines
+        lines = {"measured, without θ̃": V, f"true, {'with' if theorem.damping_known else 'without'} θ̃": true(1)}
+        yield "lyapunov", "Lyapunov function", ["V"], "N·m", lines
 
 
-def _level(theorem: TheoremCheck, time: Array) -> list[Line]:
-    """The bound of ‖z‖ where it is judged after the transient; none where there is no bound or no such time."""
-    found, name = theorem.findings, "bound, once within it"
-    if (bound := found.pointwise_radius) is None:
-        bound, name = found.radius, "bound of the root mean square"
-    judged = (time >= found.since_s + found.transient_s) & (time < (inf if found.until_s is None else found.until_s))
-    if bound is None or not judged.any():
-        return []
-    return [Line(name, np.where(judged, bound, np.nan), desired=True)]
-
-
-def _near(angles: Array, others: Array) -> Array:
-    """Angles ±360°, nearest to others [deg]. Shapes (n, 3)."""
-    return np.asarray(others + (angles - others + 180.0) % 360.0 - 180.0)
+def _norm(ticks: Ticks, law: AdaptiveSettings) -> tuple[Array, Array]:
+    """‖z^Q‖ and its V without θ̃ (C.24), from the errors that the controller computed. Shapes (n,)."""
+    sign, gain, _ = signals(ticks, law)
+    eta_e = (ticks.attitude * ticks.desired).sum(axis=1)  # (C.32)
+    z1 = (1 - sign * eta_e) ** 2 + (ticks.attitude_error**2).sum(axis=1)  # (C.39), its square
+    z2 = (ticks.rate_error + sign[:, None] * gain * ticks.attitude_error) ** 2  # (C.40); G z₁ = ±ε̃ by (C.49)
+    return np.sqrt(z1 + z2.sum(axis=1)), z1 + z2 @ np.array(law.inertia) / 2

@@ -13,8 +13,7 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
-from aeroloop.service.logs.in_force import Unknown
-from aeroloop.service.logs.session import Array, Missing
+from aeroloop.service.logs.session import Array, Missing, Unknown
 
 
 class Spread(BaseModel, frozen=True):
@@ -88,32 +87,21 @@ class LemmaCheck(BaseModel, frozen=True):
     what: str = Field(description="its left-hand side, in the paper's letters")
     samples: int
     broken: int = Field(description="samples at which it does not hold")
-    closest: float | None = Field(default=None, description="largest left-hand side as a share of the bound")
-    closest_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    closest: float = Field(description="largest left-hand side as a share of the bound")
+    closest_s: float = Field(description="when that was, on the law's clock [s]")
     broken_s: float | None = Field(default=None, description="when it was first broken [s]; null where never")
 
 
 class TheoremFindings(BaseModel, frozen=True):
-    """What is proven of a session, and whether the session kept to it.
-
-    The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
-    """
+    """What is proven of a session, and whether the session kept to it."""
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
-    holds: bool | None = Field(description="null where nothing can be promised")
+    holds: bool | None = Field(default=None, description="null where nothing can be promised")
     held: bool | None = Field(description="whether the run kept to all of it that could be judged")
-    radius: float | None = Field(
-        default=None, description="√(δ_Q/k): the root of the mean of ‖z‖² in the long run, ‖z‖ as at the end [1, rad/s]"
+    pointwise_radius: float | None = Field(
+        default=None, description="bound of ‖z‖ in the end [1, rad/s]; null unless certified"
     )
-    pointwise_radius: float | None = Field(description="bound of ‖z‖ in the end [1, rad/s]; null unless certified")
-    pointwise_deg: float | None = Field(description="the attitude error within that bound [deg]")
-    mean_square_share: float | None = Field(
-        default=None,
-        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1",
-    )
-    mean_square_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
-    mean_square_judged: int = Field(default=0, description="true states that judged it")
-    spacing_s: float | None = Field(default=None, description="longest time between two of them [s]")
+    pointwise_deg: float | None = Field(default=None, description="the attitude error within that bound [deg]")
     pointwise_share: float | None = Field(
         default=None,
         description="largest true ‖z‖ as a share of the bound that holds once it was so small; it never exceeds 1",
@@ -122,22 +110,19 @@ class TheoremFindings(BaseModel, frozen=True):
     pointwise_judged: int = Field(default=0, description="true states that judged it")
     pointwise_since_s: float | None = Field(default=None, description="from when on, on the law's clock [s]")
     pointwise_bound: float | None = Field(default=None, description="the least bound that judged [1, rad/s]")
-    transient_s: float = Field(description="how long the transient is taken to last [s]")
     since_s: float = Field(description="judged from when the reference was reached, on the law's clock [s]")
     until_s: float | None = Field(description="judged until gains or reference changed [s]; null: to the end")
-    z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
-    error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
-    true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the published true states")
-    true_error_deg: float | None = Field(description="likewise of the attitude error [deg]")
-    damping_known: bool = Field(description="whether the true V that is drawn has its θ̃ term: the plant's θ is known")
     samples: int = Field(description="true states that belong to a tick that is judged")
     outside: dict[str, int] = Field(
+        default={},
         description="how many of them do not satisfy a premise: (C.28) and (C.29), that sensors err by no more than "
-        "the quantizers, (C.30), that the command is not saturated, and Assumption 3, the assumed attitude error"
+        "the quantizers, (C.30), that the command is not saturated, and Assumption 3, the assumed attitude error",
     )
-    judged: int = Field(description="how many satisfy all of them; the inequalities are judged by these alone")
-    lemma: list[LemmaCheck]
-    broken: int | None = Field(description="inequalities broken, over all of them and all samples")
+    judged: int = Field(
+        default=0, description="how many satisfy all of them; the inequalities are judged by these alone"
+    )
+    lemma: list[LemmaCheck] = []
+    broken: int | None = Field(default=None, description="inequalities broken, over all of them and all samples")
 
 
 class Findings(Figures):
@@ -237,6 +222,12 @@ class Report:
     settings: dict[str, Any]
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     part: tuple[float, float] | None = None
+
+    @property
+    def period_s(self) -> float | None:
+        """The loop's period [s], as configured; None if the log does not have it."""
+        rate = self.settings.get("loop", {}).get("rate_hz")
+        return 1 / rate if rate else None
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

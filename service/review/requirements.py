@@ -9,47 +9,51 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.figures import Figures
 from aeroloop.service.review.report import Check, Findings
 
-_SPREADS: Final = ("latency", "period", "measurement_delay", "command_delay")
-_THEOREM: Final = ("z_norm", "true_z_norm", "radius", "pointwise_radius", "mean_square_share", "pointwise_share")
-_PERCENTILES: Final = ("p50", "p90", "p99", "p999", "max")
-
-UNITS: Final[dict[str, str]] = {
-    "duration_s": "s",
-    "z_track": "s",
-    "u_total": "V²·s",
-    "max_error_deg": "°",
-    "final_error_deg": "°",
-    **dict.fromkeys(["skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks"], ""),
-    **dict.fromkeys(["invalid", "damages"], ""),
-    **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
-    **{f"timing.{spread}.{name}": "µs" for spread in _SPREADS for name in _PERCENTILES},
-    **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
-    **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
-    **{f"theorem.{name}": "" for name in (*_THEOREM, "held", "broken")},
-    **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "pointwise_deg")},
+_DURATIONS: Final = [
+    f"{name}.{percentile}"
+    for name in ("latency", "period", "measurement_delay", "command_delay")
+    for percentile in ("p50", "p90", "p99", "p999", "max")
+]
+_AGES: Final = [f"age_us.{percentile}" for percentile in ("p50", "p99", "max")]
+_THEOREM: Final = ("pointwise_radius", "pointwise_share", "pointwise_deg")
+_BY_UNIT: Final[dict[str, Sequence[str]]] = {
+    "s": ["duration_s", "z_track"],
+    "V²·s": ["u_total"],
+    "°": ["max_error_deg", "final_error_deg", "second_half_error_deg", "theorem.pointwise_deg"],
+    "": [
+        *("skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks", "invalid", "damages"),
+        *(f"saturated.{name}" for name in ("attitude", "rate", "voltage")),
+        *(f"theorem.{name}" for name in ("pointwise_radius", "pointwise_share", "held", "broken")),
+    ],
+    "µs": [
+        *(f"latency_us.{name}" for name in ("p50", "p99", "p999", "max")),
+        *(f"timing.{name}" for name in _DURATIONS),
+        *_AGES,
+    ],
 }
+
+UNITS: Final = {name: unit for unit, names in _BY_UNIT.items() for name in names}
 """Figures that can have a limit, by their names in the findings, and their units."""
 
 SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
     "gaps": "gap_count",
-    **{f"{name}.{p}": f"timing.{name}.{p}" for name in _SPREADS for p in _PERCENTILES},
+    **{name: f"timing.{name}" for name in _DURATIONS},
     "theorem": "theorem.held",
-    **{name: f"theorem.{name}" for name in (*_THEOREM, "pointwise_deg")},
-    "settled_error_deg": "theorem.error_deg",
-    "true_settled_error_deg": "theorem.true_error_deg",
+    **{name: f"theorem.{name}" for name in _THEOREM},
     "lemma_broken": "theorem.broken",
-    **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
+    **{path.replace("_us", ""): path for path in _AGES},
 }
 """Other names for some of them."""
+
+NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
+"""Names that `--require` lists."""
 
 UNSEEN_SHOWN: Final = 3
 """Of what a figure does not see, so many are listed in its line."""
 
 AT_LEAST: Final = ("theorem.held",)
 """Figures of which more is better."""
-
-NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
 
 
 class LimitError(AeroloopError):
@@ -90,39 +94,32 @@ class Limit(NamedTuple):
         """The figure's name in the findings."""
         return SHORT.get(self.figure, self.figure)
 
-    def value(self, figures: Figures) -> float | None:
-        """The figure's value; None if it is unavailable."""
-        return value_of(figures, self.path)
-
     def holds(self, figures: Figures) -> bool:
         """Whether the figure is within the limit; an unavailable one is not."""
-        value = self.value(figures)
+        value = value_of(figures, self.path)
         return value is not None and (value >= self.bound if self.path in AT_LEAST else value <= self.bound)
 
-    def unseen(self, findings: Findings, limits: Sequence[Limit]) -> str:
-        """What the figure does not see, in words, if it seems to hold; empty where all was seen, or is permitted.
-
-        A limit of `missing_ticks` or `damages` among `limits` permits as many.
-        """
-        permitted = {limit.path for limit in limits if limit.holds(findings)}
-        found = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
-        if not self.holds(findings) or not found:
-            return ""
-        lines = [line for of_one in found.values() for line in of_one]
-        more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
-        permits = " ".join(f"--require {figure}={value_of(findings, figure):g}" for figure in found)
-        return f", but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
-
     def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
-        """Whether it holds, and what was found, required together with `limits`."""
-        value, unseen, unit = self.value(findings), self.unseen(findings, limits), UNITS[self.path]
+        """Whether it holds, and what was found.
+
+        A limit that seems to hold does not where ticks or parts of files are unseen, unless `limits`, which are
+        required together with it, permit as many `missing_ticks` or `damages`.
+        """
+        value, unit = value_of(findings, self.path), UNITS[self.path]
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if f"{self.path}.".startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
+        permitted = {limit.path for limit in limits if limit.holds(findings)}
+        unseen = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
+        if self.holds(findings) and unseen:
+            lines = [line for of_one in unseen.values() for line in of_one]
+            more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
+            permits = " ".join(f"--require {figure}={value_of(findings, figure):g}" for figure in unseen)
+            found += f", but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
         return Check(
             text=f"{self.figure} {'≥' if self.path in AT_LEAST else '≤'} {self.bound:g}{space}{unit}",
             holds=self.holds(findings) and not unseen,
-            found=found + unseen,
+            found=found,
         )
 
 

@@ -11,20 +11,19 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import inf, isnan
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.figures import Figures, figures
-from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import Missing, Session
-from aeroloop.service.logs.ticks import Recomputed, Ticks, recompute
-from aeroloop.service.review.events import Happened, Messages, age_us, fault_intervals, happened, read_messages
+from aeroloop.service.logs.session import Missing, Session, Unknown
+from aeroloop.service.logs.ticks import Ticks, recompute
+from aeroloop.service.review.events import Messages, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
-from aeroloop.service.review.report import Disagreement, FaultInterval, Findings, Recorded, Report, flat
+from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
@@ -54,12 +53,25 @@ class Review:
     facts: dict[str, dict[str, Any]]
     part: tuple[float, float] | None
 
+    def checked(self, limits: Sequence[Limit] = ()) -> Findings:
+        """The findings, checked against limits."""
+        return self.findings.model_copy(update={"checks": [limit.check(self.findings, limits) for limit in limits]})
+
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
         time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
-        checks = [limit.check(self.findings, limits) for limit in limits]
-        findings, settings = self.findings.model_copy(update={"checks": checks}), self.settings.description()
+        findings, settings = self.checked(limits), self.settings.description()
         return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
+
+
+def review(*paths: Path) -> Figures:
+    """Figures of a run's longest session. Raises as `read` does."""
+    return read(*paths).figures
+
+
+def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
+    """Report of a run's longest session, checked against limits. Raises as `read` does."""
+    return read(*paths, progress=progress).report(limits)
 
 
 def read(
@@ -89,67 +101,31 @@ def read(
         its = recording.session(which, since_s, until_s)
     except ConfigError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    part = None if (since_s, until_s) == (-inf, inf) else (since_s, until_s)
-    if part is not None and not len(its.k):
-        lasts = its.extent.ticks * its.settings.loop.period
-        raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
-    messages = read_messages(recording, which, its.settings.wire.actuators)
-    first, last = (0, max(its.extent.last.values())) if part is None else its.k[[0, -1]].tolist()
-    events, faults = happened(messages, its, (first, last), session is not None), fault_intervals(messages, its)
+    settings, loop, last = its.settings, its.settings.loop, max(its.extent.last.values())
+    part, span = None, (0, last)
+    unseen: list[Missing | Unknown] = [*(gap for gap in its.missing if gap.rows), *its.unknown]
+    if (since_s, until_s) != (-inf, inf):
+        part = since_s, until_s
+        if not len(its.k):
+            lasts = its.extent.ticks * loop.period
+            raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
+        span = int(its.k[0]), int(its.k[-1])
+        since, until = since_s / loop.period, until_s / loop.period
+        unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
+    messages = read_messages(recording, which, settings.wire.actuators)
+    events, faults = happened(messages, its, span, session is not None), fault_intervals(messages, its)
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
-    seen = _Seen(events, faults, lapses(its, judged.missed))
+    ticks, went = judged.ticks, lapses(its, judged.missed)
     its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
-    merits, findings, theorem = _judge(recording, its, judged, messages, seen, part)
-    facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in its.descriptions.items()}
-    for kind, values in recording.metadata.items():
-        facts.setdefault(kind, {}).update(values)
-    for _, role, status in messages.published:
-        if isinstance(status, Status) and status.notes:
-            facts.setdefault(role, {})["notes"] = status.notes
-    first = paths[0].resolve()
-    name = first.name if first.is_dir() else first.stem
-    name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    return Review(merits, findings, its.settings, judged.ticks, theorem, name, facts, part)
 
-
-def review(*paths: Path) -> Figures:
-    """Figures of a run's longest session. Raises as `read` does."""
-    return read(*paths).figures
-
-
-def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
-    """Report of a run's longest session, checked against limits. Raises as `read` does."""
-    return read(*paths, progress=progress).report(limits)
-
-
-class _Seen(NamedTuple):
-    """What is seen in the rows of a session alone."""
-
-    happened: Happened
-    faults: list[FaultInterval]
-    lapses: dict[str, int]
-
-
-def _judge(
-    recording: Recording,
-    session: Session,
-    judged: Recomputed,
-    messages: Messages,
-    seen: _Seen,
-    part: tuple[float, float] | None,
-) -> tuple[Figures, Findings, TheoremCheck]:
-    """Figures, findings and the theorem's lines of a session, whose rows are not needed any more."""
-    (vehicle, name), settings, ticks, offset = session.which, session.settings, judged.ticks, judged.offset_ns
-    loop = settings.loop
-    spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, session.which))
-    known, latency = not loop.lockstep and not isnan(offset[0]), spreads.get("latency")
-    unanswered = None if latency else "no measurement was answered"
+    spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, which))
+    latency, offset = spreads.get("latency"), None if isnan(judged.offset_ns[0]) else judged.offset_ns
     unavailable = {
-        "latency_us": unanswered,
+        "latency_us": None if latency else "no measurement was answered",
         "age_us": None if age else "the log has no status of the controller with an age",
         "timing.period": None if "period" in spreads else "fewer than two measurements",
-        "timing.latency": unanswered,
-        "clock_offset_us": None if known else "too few ticks have all four times of sending and receiving",
+        "timing.latency": None if latency else "no measurement was answered",
+        "clock_offset_us": None if offset else "too few ticks have all four times of sending and receiving",
     }
     reasons = {key: LOCKSTEP if loop.lockstep else why for key, why in unavailable.items() if why}
     if part is not None:
@@ -163,54 +139,62 @@ def _judge(
         unsent=judged.unsent,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         log=recording.name,
-        trips=seen.happened.trips,
+        trips=events.trips,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
-        damages=[
-            *recording.unread,
-            *(f"malformed: {count} of {topic}" for topic, count in sorted(messages.malformed.items())),
-        ],
+        damages=[*recording.unread, *(f"malformed: {n} of {topic}" for topic, n in sorted(messages.malformed.items()))],
     )
-    description = session.descriptions.get("controller")
-    certificate = description.certificate if description else None
-    theorem = check_theorem(settings, ticks, messages.truths, session.changes, certificate, faults=bool(seen.faults))
+    controller = its.descriptions.get("controller")
+    certificate = controller.certificate if controller else None
+    theorem = check_theorem(settings, ticks, messages.truths, its.changes, certificate, faults=bool(faults))
     gap_count, longest = gaps(judged.answered, loop.period)
     saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
-    missing = [gap for gap in recording.missing if gap.vehicle == vehicle]
-    unseen: list[Missing | Unknown] = [*(gap for gap in session.missing if gap.rows), *session.unknown]
-    if part is not None:
-        since, until = part[0] / loop.period, part[1] / loop.period
-        unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
+    missing = [gap for gap in recording.missing if gap.vehicle == which[0]]
     started_s = ticks.wall_ns[:1] * 1e-9
     findings = Findings(
-        **{key: getattr(merits, key) for key in Figures.model_fields if key != "reasons"},
+        **{key: value for key, value in merits if key != "reasons"},
         reasons=merits.reasons | reasons | theorem.reasons,
-        vehicle=vehicle,
-        session=name,
-        sessions=len(recording.sessions_of(vehicle)),
+        vehicle=which[0],
+        session=which[1],
+        sessions=len(recording.sessions_of(which[0])),
         recorded=[
             Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
             for (owner, one), extent in recording.extents.items()
         ],
-        disagreements=disagreements(session.descriptions),
+        disagreements=disagreements(its.descriptions),
         started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
         timing=spreads,
-        clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if known else None,
+        clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None,
         age_us=age,
         gaps=longest,
         gap_count=gap_count,
         saturated=saturated,
         invalid=invalid,
-        losses=seen.happened.losses,
+        losses=events.losses,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
         missing=missing,
-        unknown=session.unknown,
+        unknown=its.unknown,
         unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
-        lapses=seen.lapses,
+        lapses=went,
         theorem=theorem.findings,
-        marks=seen.happened.marks,
-        faults=seen.faults,
+        marks=events.marks,
+        faults=faults,
     )
-    return merits, findings, theorem
+    path = paths[0].resolve()
+    name = path.name if path.is_dir() else path.stem
+    name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
+    return Review(merits, findings, settings, ticks, theorem, name, _facts(recording, its, messages), part)
+
+
+def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:
+    """Facts about software and host by role: of descriptions, of the recorder's metadata, and the statuses' notes."""
+    described = session.descriptions.items()
+    facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in described}
+    for kind, values in recording.metadata.items():
+        facts.setdefault(kind, {}).update(values)
+    for _, role, status in messages.published:
+        if isinstance(status, Status) and status.notes:
+            facts.setdefault(role, {})["notes"] = status.notes
+    return facts
 
 
 def _in_words(part: tuple[float, float]) -> str:
@@ -222,11 +206,10 @@ def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
     """Keys of the loop, the wire and the plant in which the two ends' configurations differ."""
     if not {"controller", "plant"} <= described.keys():
         return []
-    tables = [flat(described[role].config) for role in ("controller", "plant")]
-    keys = sorted(set().union(*tables))
+    controller, plant = (flat(described[role].config) for role in ("controller", "plant"))
     return [
-        Disagreement(key=key, controller=values[0], plant=values[1])
-        for key in keys
+        Disagreement(key=key, controller=controller.get(key), plant=plant.get(key))
+        for key in sorted(controller.keys() | plant.keys())
         if key.startswith(("loop.", "wire.", "plant.")) and not key.startswith(OWN_AFFAIRS)
-        if (values := [table.get(key) for table in tables])[0] != values[1]
+        if controller.get(key) != plant.get(key)
     ]

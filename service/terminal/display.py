@@ -12,8 +12,7 @@ from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.columns import Columns
-from rich.console import Console, Group, RenderableType
-from rich.layout import Layout
+from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -28,11 +27,12 @@ from rich.progress import (
 from rich.table import Column, Table
 from rich.text import Text
 
+from aeroloop.protocol.wire.attitude import angle
 from aeroloop.service.figures import Figures
 
 if TYPE_CHECKING:
-    from aeroloop.service.host.doctor import Diagnosis
-    from aeroloop.service.lab.demo import Progress as DemoProgress
+    from aeroloop.service.config import Settings
+    from aeroloop.service.testing.process_group import ProcessGroup
 
 LABELS: Final = 22
 """Width of the column of labels."""
@@ -112,56 +112,25 @@ def share_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[float],
 
 
 @contextmanager
-def live_screen() -> Iterator[Callable[[Callable[[int], RenderableType], Text], None]]:
-    """A function that redraws the whole terminal: a view, given for a width, and a footer at the bottom."""
-    console = Console()
-    with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
-
-        def show(draw: Callable[[int], RenderableType], footer: Text) -> None:
-            drawing = draw(console.width)
-            if console.is_terminal:
-                layout = Layout()
-                layout.split_column(Layout(drawing), Layout(footer, size=1))
-                drawing = layout
-            live.update(drawing, refresh=True)
-
-        yield show
-
-
-def diagnosis_table(diagnosis: Diagnosis) -> None:
-    """Print the findings of a diagnosis of this machine."""
-    table = Table("", "checked", "found", "to change", box=None)
-    for finding in diagnosis.findings:
-        table.add_row("✓" if finding.good else "✗", finding.what, finding.found, "" if finding.good else finding.advice)
-    Console().print(table)
-    holds = "holds" if diagnosis.holds else "does not hold"
-    Console().print(f"this machine {holds} {diagnosis.rate_hz:g} Hz", style="bold")
-
-
-@contextmanager
-def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
+def live_demo(settings: Settings, total_s: float) -> Iterator[Callable[[str, ProcessGroup], None]]:
     """The demo's live view on stderr: what it waits for; from the first command on, a bar and the figures of now."""
     bar = Progress(BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), console=_stderr)
     task = bar.add_task("", total=total_s)
     with Live("starting", console=_stderr, refresh_per_second=10, transient=True) as live:
 
-        def update(now: DemoProgress) -> None:
-            if now.waiting_for:
-                states = ", ".join(f"{role} {status.state}" for role, status in sorted(now.statuses.items()))
-                live.update(
-                    f"waiting for {now.waiting_for}" + (f" ({states})" if states and not now.time_s else ""),
-                    refresh=True,
-                )
+        def update(waiting_for: str, now: ProcessGroup) -> None:
+            if waiting_for or now.telemetry is None:
+                states = f" ({now.states})" if now.states and now.telemetry is None else ""
+                live.update(f"waiting for {waiting_for}{states}", refresh=True)
                 return
-            bar.update(task, completed=now.time_s)
+            bar.update(task, completed=now.telemetry.tick * settings.loop.period)
             figures = [
-                f"error {degrees(now.error_rad):5.2f}°",
-                f"voltages {' '.join(f'{u:+6.1f}' for u in now.voltages)} V",
+                f"error {degrees(angle(*now.telemetry.attitude_error)):5.2f}°",
+                f"voltages {' '.join(f'{u:+6.1f}' for u in now.telemetry.voltages)} V",
             ]
             if "controller" in now.statuses:
-                up, down = now.bits_per_s
-                figures.append(f"{now.rate_hz:3.0f} ticks/s, {now.skipped} skipped")
-                figures.append(f"payload {up / 1000:.1f} + {down / 1000:.1f} kbit/s")
+                skipped = sum(status.skipped for status in now.statuses.values())
+                figures.append(f"{now.statuses['controller'].rate_hz:3.0f} ticks/s, {skipped} skipped")
             live.update(Group(bar, Columns(figures, padding=(0, 3, 0, 0))))
 
         yield update

@@ -13,8 +13,11 @@ _OWN = ("event", "role", "vehicle", "session", "tick")
 """Keys of `log_event`'s records."""
 
 
-class _JsonLines(logging.Formatter):
+class JsonLines(logging.Formatter):
+    """A record as one line of JSON."""
+
     def format(self, record: logging.LogRecord) -> str:
+        """The line."""
         line = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
@@ -27,9 +30,9 @@ class _JsonLines(logging.Formatter):
         return json.dumps(line, ensure_ascii=False)
 
 
-def set_up_logging(level: int, *, as_json: bool = False) -> None:
-    """Log to stderr from this level up."""
+def set_up_logging(*, as_json: bool = False) -> None:
+    """Log to stderr, from `info` up."""
     handler = logging.StreamHandler()
     text = logging.Formatter("%(asctime)s %(levelname)s %(role)s: %(message)s", defaults={"role": "aeroloop"})
-    handler.setFormatter(_JsonLines() if as_json else text)
-    logging.basicConfig(level=level, handlers=[handler])
+    handler.setFormatter(JsonLines() if as_json else text)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])

@@ -13,17 +13,8 @@ from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
 
-from aeroloop.service.report.rows import (
-    PERCENTILES,
-    THEOREM,
-    count,
-    durations,
-    figure_rows,
-    grave,
-    missing,
-    shown,
-    theorem_sentences,
-)
+from aeroloop.service.report import rows
+from aeroloop.service.report.rows import count, grave, missing
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, Spread, differences
 from aeroloop.service.terminal.display import figures_table, labelled
 
@@ -60,8 +51,8 @@ def review_account(findings: Findings) -> None:
     figures_table(findings.model_copy(update={"trips": [], "damages": []}))
     console.print()
     if findings.timing:
-        table = Table("", *PERCENTILES.values(), "", box=None, pad_edge=False, header_style="")
-        for row in durations([findings]):
+        table = Table("", *rows.PERCENTILES.values(), "", box=None, pad_edge=False, header_style="")
+        for row in rows.durations([findings]):
             table.add_row(
                 row.label, *row.percentiles, sparkline(row.spread) if row.spread and console.width >= 80 else ""
             )
@@ -73,14 +64,8 @@ def review_account(findings: Findings) -> None:
     console.print(table)
     if findings.theorem is not None:
         console.print()
-        for good, text in theorem_sentences(findings):
-            style = {True: "green", False: "bold red"}.get(good, "") if good is not None else ""
-            console.print(Text(text, style=style))
-        table = Table(show_header=False, box=None, pad_edge=False)
-        for figure, values, _ in figure_rows([findings]):
-            if figure.key.startswith(THEOREM) and values[0].number is not None:
-                table.add_row(figure.name, Text(values[0].text, justify="right"), figure.unit)
-        console.print(table)
+        for good, text in rows.theorem_sentences(findings):
+            console.print(Text(text, style="" if good is None else "green" if good else "bold red"))
     others = [entry for entry in since if not grave(entry[1])]
     if before or others:
         console.print()
@@ -103,10 +88,10 @@ def comparison_tables(reports: Sequence[Report]) -> None:
         figures.add_column(escape(report.name), justify="right")
         differing.add_column(escape(report.name), overflow="fold")
     figures.add_column("")
-    for row in figure_rows([report.findings for report in reports]):
+    for row in rows.figure_rows([report.findings for report in reports]):
         figures.add_row(row.figure.name, *(value.text for value in row.values), row.figure.unit)
     for key, values in differences(reports):
-        differing.add_row(key, *(escape(shown(value)) for value in values))
+        differing.add_row(key, *(escape(rows.shown(value)) for value in values))
     console.print(figures)
     console.print()
     console.print(differing if differing.row_count else "the configurations are the same")
@@ -161,7 +146,8 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "", f"… and {more} more keys; --json has them all"
     if (part := findings.reasons.get("duration_s")) is not None:
         yield "part", part
-    yield "session", f"{findings.session} of {findings.vehicle}, {_utc(findings.started)}"
+    started = findings.started.replace("T", " ").replace("+00:00", " UTC")
+    yield "session", f"{findings.session} of {findings.vehicle}, {started}"
     vehicles = dict.fromkeys(one.vehicle for one in findings.recorded)
     if len(vehicles) > 1:
         yield "vehicles", f"{', '.join(vehicles)}; shown is {findings.vehicle}, --vehicle shows another"
@@ -172,10 +158,6 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
             if shown or i <= SESSIONS_SHOWN:
                 yield "sessions" if i == 1 else "", f"{i}  {one.session}, {one.duration_s:.1f} s{shown}"
         yield "", f"--session N shows another of {len(its)}"
-
-
-def _utc(started: str) -> str:
-    return started.replace("T", " ").replace("+00:00", " UTC")
 
 
 def _faults_table(faults: Sequence[FaultInterval]) -> Table:

@@ -1,32 +1,37 @@
-"""Live view of the network: every role of every vehicle, from its published messages.
+"""Live view of the network, `op top`: every role of every vehicle, from its published messages.
 
-Subscribes to status, telemetry, truth and events, and queries descriptions, which hold the wire. What is shown is true
-now: values of a session that has ended are left out, and what was not received for `SILENT_S` is marked with its age.
+Subscribes to status, telemetry, truth and events. What is shown is true now: values of a session that has ended are
+left out, and what was not received for `SILENT_S` is marked with its age.
 """
 
 from __future__ import annotations
 
+import os
+import select
+import sys
+import termios
 import threading
 import time
+import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import degrees, inf
+from math import degrees
 from typing import Final
 
 import zenoh
 from pydantic import ValidationError
 from rich.columns import Columns
-from rich.console import Group, RenderableType
+from rich.console import Console, Group
+from rich.live import Live
 from rich.text import Text
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import Event, Status, Telemetry, Truth
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle, to_euler
-from aeroloop.service.config import ConfigError, Settings, from_description
-from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.host.health import SILENT_S
 from aeroloop.service.terminal.roles import STALE, WAITING, duration, roles_view
 
@@ -36,19 +41,18 @@ EVENTS: Final = 5
 
 @dataclass
 class Vehicle:
-    """The latest messages of one vehicle, with the time of their arrival on `time.monotonic()`."""
+    """The latest messages of one vehicle, with the time of their arrival on the clock [s]."""
 
     statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
     telemetry: tuple[float, Telemetry] | None = None
     truth: tuple[float, Truth] | None = None
-    settings: Settings | None = None
-    payload: PayloadRate = field(default_factory=PayloadRate)
 
 
 class Top:
     """Collects messages and draws them."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._lock = threading.Lock()
         self._vehicles: dict[str, Vehicle] = {}
         self._events: deque[str] = deque(maxlen=EVENTS)
@@ -63,30 +67,25 @@ class Top:
             try:
                 match address.topic.name:
                     case "status" if address.role is not None:
-                        status = Status.model_validate_json(payload)
-                        vehicle.statuses[address.role] = time.monotonic(), status
-                        if address.role == "controller":
-                            vehicle.payload.receive(status)
+                        vehicle.statuses[address.role] = self._clock(), Status.model_validate_json(payload)
                     case "telemetry":
-                        vehicle.telemetry = time.monotonic(), Telemetry.model_validate_json(payload)
+                        vehicle.telemetry = self._clock(), Telemetry.model_validate_json(payload)
                     case "truth":
-                        vehicle.truth = time.monotonic(), Truth.model_validate_json(payload)
-                    case "description" if address.role in ("plant", "controller"):
-                        vehicle.settings = from_description(Description.model_validate_json(payload).config)
+                        vehicle.truth = self._clock(), Truth.model_validate_json(payload)
                     case "event":
                         event = Event.model_validate_json(payload)
                         self._events.append(
                             f"{time.strftime('%H:%M:%S')} {address.vehicle} {address.role}: {event.text}"
                         )
-            except (ValidationError, ConfigError):
+            except ValidationError:
                 pass  # of another version; its other messages may still parse
 
-    def draw(self, width: int) -> RenderableType:
+    def draw(self, width: int) -> Group:
         """The current view, for a terminal of this width."""
         with self._lock:
             if not self._vehicles:
-                return Text("no role on the network yet")
-            now, blocks = time.monotonic(), list[RenderableType]()
+                return Group(Text("no role on the network yet"))
+            now, blocks = self._clock(), list[Text | Columns | Group]()
             for name, vehicle in sorted(self._vehicles.items()):
                 statuses = {role: (now - at, status) for role, (at, status) in vehicle.statuses.items()}
                 values = Columns(_values(vehicle, statuses, now), padding=(0, 3, 0, 0))
@@ -95,14 +94,16 @@ class Top:
 
 
 def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[Text]:
-    """Attitude, error, voltages and payload, as far as they are those of now."""
+    """Attitude, error and voltages, as far as they are those of now."""
     if vehicle.truth is not None:
         at, truth = vehicle.truth
         roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
         text = f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°"
         yield Text(text) if now - at < SILENT_S else Text(f"no attitude for {duration(now - at)}", style=WAITING)
     at, telemetry = vehicle.telemetry or (now, None)
-    session = _session(statuses)
+    # The session that runs, by the plant, or by the controller where there is no plant.
+    age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
+    session = status.session if status is not None and age < SILENT_S else None
     if session is None:
         if statuses:
             yield Text("no session: no error, no voltages", style=STALE)
@@ -114,35 +115,15 @@ def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now:
     else:
         yield Text(f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°")
         yield Text("voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V")
-    if vehicle.settings is not None and "controller" in statuses:
-        measured, commanded = vehicle.payload.bits_per_s(vehicle.settings.wire)
-        yield Text(f"payload {measured / 1000:.1f} + {commanded / 1000:.1f} kbit/s")
 
 
-def _session(statuses: Mapping[str, tuple[float, Status]]) -> str | None:
-    """The session that runs, by the plant, or by the controller where there is no plant; None if that is silent."""
-    age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
-    return status.session if status is not None and age < SILENT_S else None
-
-
-def watch(
-    network: NetworkSettings,
-    show: Callable[[Callable[[int], RenderableType], Text], None],
-    stop: threading.Event,
-    read: Callable[[float], str] | None,
-) -> None:
-    """Subscribe, and draw five times a second until `stop` is set or `q` is pressed.
-
-    Args:
-        network: The network to watch.
-        show: Draws a view, given for a width, and a footer.
-        stop: Ends it.
-        read: Waits for keys up to a time [s]; None without a keyboard.
+def watch(network: NetworkSettings) -> None:
+    """Subscribe, and draw five times a second until `q` is pressed, or ^C.
 
     Raises:
         NetworkError: The network cannot be joined.
     """
-    top = Top()
+    top, console = Top(), Console()
 
     def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
@@ -151,17 +132,41 @@ def watch(
         if reply.ok is not None:
             receive(reply.ok)
 
-    with join(network, listen=False) as session:
+    with (
+        join(network, listen=False) as session,
+        keyboard() as wait_for_keys,
+        Live(console=console, auto_refresh=False, screen=console.is_terminal) as live,
+    ):
         session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
-        queried = -inf
-        while not stop.is_set():
-            if time.monotonic() - queried > 2.0:  # for roles that have joined since
-                queried = time.monotonic()
-                session.get(topics.key("description", "*"), answered, timeout=1.0)
-            show(top.draw, Text("q: quit" if read else "", style=STALE))
-            if read is None:
-                stop.wait(REFRESH_S)
-            elif "q" in read(REFRESH_S):
-                return
+        live.update(top.draw(console.width), refresh=True)
+        while "q" not in wait_for_keys(REFRESH_S):
+            live.update(top.draw(console.width), refresh=True)
+
+
+@contextmanager
+def keyboard() -> Iterator[Callable[[float], str]]:
+    """A function that waits up to a time [s] for keys and returns them, `q` where the terminal is gone.
+
+    Where stdin is no terminal it only waits. The terminal's mode is restored at the end.
+    """
+    terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+
+    def keys(wait_s: float) -> str:
+        if terminal is None:
+            time.sleep(wait_s)
+        elif select.select([terminal], [], [], wait_s)[0]:
+            pressed = os.read(terminal, 64).decode(errors="ignore") or "q"
+            return "" if pressed.startswith("\x1b") else pressed  # an arrow key, for example
+        return ""
+
+    if terminal is None:
+        yield keys
+        return
+    before = termios.tcgetattr(terminal)
+    tty.setcbreak(terminal)
+    try:
+        yield keys
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)

@@ -1,6 +1,6 @@
 """Roles of a vehicle as `op status` and `op top` draw them: a table, and a line for each cause and note.
 
-What is silent is dimmed, and marked with the age of its last status. The table fits in 60 columns; at `WIDE`, more.
+What is silent is marked with the age of its last status.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from rich.console import Console, Group
-from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles, Status
@@ -18,19 +17,15 @@ from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.transport.certificate import SOON_DAYS
 from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
 from aeroloop.service.host.operator import Gathered
+from aeroloop.service.terminal.show import Row, table
 
-WIDE: Final = 90
-"""Columns of the terminal from which on all columns of the table are drawn."""
 GOOD, BAD, WAITING, STALE = "green", "bold red", "yellow", "dim"
-_STYLES: Final = {
-    "running": GOOD,
-    "driven": GOOD,
-    "recording": GOOD,
-    "routing": GOOD,
-    "tripped": BAD,
-    "faulted": BAD,
-    NOT_RECORDING: BAD,
+SILENT: Final = "silent"
+STYLES: Final = {
+    **dict.fromkeys(("running", "driven", "recording", "routing"), GOOD),
+    **dict.fromkeys(("tripped", "faulted", NOT_RECORDING, SILENT), BAD),
 }
+"""Of a role's state; other states are `WAITING`."""
 
 
 def roles_view(statuses: Mapping[str, tuple[float, Status]], width: int) -> Group:
@@ -40,28 +35,11 @@ def roles_view(statuses: Mapping[str, tuple[float, Status]], width: int) -> Grou
         statuses: By role: the age of its status [s], and the status.
         width: Columns of the terminal.
     """
-    wide = width >= WIDE
-    titles = ["rate\n1/s", "skipped\nticks", "latency\np50/p99 µs"]
-    titles += ["answers in\np50/p99 µs", "wake-up\np50/p99 µs"] if wide else []
-    numbers = (Column(title, justify="right", no_wrap=True) for title in (*titles, "up"))
-    table = Table(Column("role", no_wrap=True), "state", *numbers, box=None, pad_edge=False, header_style="dim")
-    lines: list[Text] = []
-    for role, (age, status) in sorted(statuses.items()):
-        silent = age > SILENT_S
-        state = Text("silent", style=BAD) if silent else Text(status.state, style=_STYLES.get(status.state, WAITING))
-        wake = status.timing.recent_wake if status.timing else None
-        table.add_row(
-            role,
-            state,
-            f"{status.rate_hz:.0f}",
-            str(status.skipped),
-            *(_p50_p99(spread) for spread in (status.latency_us, status.age_us, wake)[: 3 if wide else 1]),
-            duration(status.uptime_s),
-            style=STALE if silent else "",
-        )
-        lines += _lines(role, age, status, silent)
+    rows = [_row(role, age, status) for role, (age, status) in sorted(statuses.items())]
+    lines = [line for role, (age, status) in sorted(statuses.items()) for line in _lines(role, age, status)]
     lines += [Text(f"no {role}", style=WAITING) for role in NEEDED if role not in statuses]
-    return Group(table, *lines)
+    styles = {row["state"]: STYLES.get(row["state"], WAITING) for row in rows}
+    return Group(*([table(rows, width, styles=styles)] if rows else []), *lines)
 
 
 def status_view(found: Gathered) -> None:
@@ -82,20 +60,31 @@ def troubles_view(found: Gathered) -> None:
         console.print(Text(f"{vehicle} is well: {states}", style=GOOD), soft_wrap=True)
 
 
-def _lines(role: str, age: float, status: Status, silent: bool) -> Iterator[Text]:
-    if silent:
+def _row(role: str, age: float, status: Status) -> Row:
+    def p50_p99(spread: Percentiles | None) -> str:
+        return f"{spread.p50:.0f}/{spread.p99:.0f}" if spread else "–"
+
+    return {
+        "role": role,
+        "state": SILENT if age > SILENT_S else status.state,
+        "rate 1/s": f"{status.rate_hz:.0f}",
+        "skipped ticks": str(status.skipped),
+        "latency p50/p99 µs": p50_p99(status.latency_us),
+        "answers in p50/p99 µs": p50_p99(status.age_us),
+        "up": duration(status.uptime_s),
+    }
+
+
+def _lines(role: str, age: float, status: Status) -> Iterator[Text]:
+    if age > SILENT_S:
         yield Text(f"{role}: no status for {duration(age)}, then {status.state}", style=BAD)
     if status.cause:
         since = f" ({status.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" if status.since else ""
-        yield Text(f"{role}: {status.cause}{since}", style=_STYLES.get(status.state, WAITING))
+        yield Text(f"{role}: {status.cause}{since}", style=STYLES.get(status.state, WAITING))
     if status.unkept:
         yield Text(f"{role}: would forget a stop at a restart: {status.unkept}", style=BAD)
-    if status.certificate_until:
-        left = status.certificate_until - datetime.now(UTC)
-        if left < timedelta(days=SOON_DAYS):
-            yield Text(
-                f"{role}: its certificate expires at {status.certificate_until:%Y-%m-%d %H:%M} UTC", style=WAITING
-            )
+    if (until := status.certificate_until) and until - datetime.now(UTC) < timedelta(days=SOON_DAYS):
+        yield Text(f"{role}: its certificate expires at {until:%Y-%m-%d %H:%M} UTC", style=WAITING)
     for note in status.notes:
         yield Text(f"{role}: {note}", style=WAITING)
     for fault in status.faults:
@@ -114,7 +103,3 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * unit:
             return f"{seconds / unit:.0f} {name}"
     return f"{seconds:.0f} s"
-
-
-def _p50_p99(spread: Percentiles | None) -> str:
-    return f"{spread.p50:.0f}/{spread.p99:.0f}" if spread else "–"

@@ -11,7 +11,7 @@ from typing import Final, Literal, TypeAlias, TypeVar
 import typer
 from pydantic import BaseModel
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
@@ -22,9 +22,16 @@ Result = TypeVar("Result", bound=BaseModel)
 
 _PIPE_WIDTH: Final = 160
 _GAP: Final = 2
+NO_STYLES: Final[Mapping[str, str]] = {}
 
 
-def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
+def show(
+    rows: Sequence[Row],
+    title: str = "",
+    form: Format = "terminal",
+    keys: int = 1,
+    styles: Mapping[str, str] = NO_STYLES,
+) -> None:
     """Print rows, all with the same columns, and a title; without rows the title is a paragraph.
 
     Args:
@@ -32,6 +39,7 @@ def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: 
         title: Above the table, in a terminal and in Markdown.
         form: One of four.
         keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
+        styles: In a terminal, of cells with these texts.
     """
     if form == "json":
         typer.echo(json.dumps(rows, ensure_ascii=False, indent=2))
@@ -42,15 +50,26 @@ def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: 
     elif form == "markdown":
         typer.echo("\n".join(_markdown(rows, title)))
     else:
-        _in_terminal(rows, title, keys)
+        console = Console()
+        if not console.is_terminal:
+            console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
+        if title:
+            console.print(Text(title, style="italic" if rows else ""), soft_wrap=not console.is_terminal)
+        if rows:
+            console.print(table(rows, console.width, keys, styles))
 
 
-def show_all(sheets: Iterable[tuple[str, Sequence[Row]]], form: Format = "terminal", keys: int = 1) -> None:
+def show_all(
+    sheets: Iterable[tuple[str, Sequence[Row]]],
+    form: Format = "terminal",
+    keys: int = 1,
+    styles: Mapping[str, str] = NO_STYLES,
+) -> None:
     """Print tables and paragraphs, with a line between them."""
     for i, (title, rows) in enumerate(sheets):
         if i:
             typer.echo("")
-        show(rows, title, form, keys)
+        show(rows, title, form, keys, styles)
 
 
 def show_result(
@@ -86,27 +105,23 @@ def _right(rows: Sequence[Row]) -> list[bool]:
     return [i > 0 and numbers(column) for i, column in enumerate(rows[0])]
 
 
-def _in_terminal(rows: Sequence[Row], title: str, keys: int) -> None:
-    console = Console()
-    if not console.is_terminal:
-        console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
-    if title:
-        console.print(Text(title, style="italic" if rows else ""), soft_wrap=not console.is_terminal)
-    if not rows:
-        return
-    least = {name: _least(rows, name, console.width) for name in rows[0]}
+def table(rows: Sequence[Row], width: int, keys: int = 1, styles: Mapping[str, str] = NO_STYLES) -> Group:
+    """Rows as a table that is at most so wide: blocks of columns below each other where not all fit side by side."""
+    least = {name: _least(rows, name, width) for name in rows[0]}
     right = dict(zip(rows[0], _right(rows), strict=True))
-    for columns in _blocks(least, console.width, keys):
-        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
+    tables = []
+    for columns in _blocks(least, width, keys):
+        drawn = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in columns}
-        folds = sum(whole.values()) + _GAP * (len(columns) - 1) > console.width
+        folds = sum(whole.values()) + _GAP * (len(columns) - 1) > width
         for name in columns:
             is_long = max(cell_len(row[name]) for row in rows) > least[name]
-            width = least[name] if folds and not is_long else None
-            table.add_column(name, justify="right" if right[name] else "left", width=width, min_width=least[name])
+            fixed = least[name] if folds and not is_long else None
+            drawn.add_column(name, justify="right" if right[name] else "left", width=fixed, min_width=least[name])
         for row in rows:
-            table.add_row(*(Text(row[name]) for name in columns))
-        console.print(table)
+            drawn.add_row(*(Text(row[name], style=styles.get(row[name], "")) for name in columns))
+        tables.append(drawn)
+    return Group(*tables)
 
 
 def _least(rows: Sequence[Row], name: str, available: int) -> int:

@@ -1,8 +1,8 @@
 """Hardware-in-the-loop tests: runs controller, plant and recorder as a process group, operates it and injects faults.
 
-The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too. In real time `run` sleeps; in lockstep
-the plant takes an exact number of steps, and what an operator requests between two of them holds from the next tick on,
-so a test repeats bit for bit on a busy machine.
+The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too, in a script with the usual
+`if __name__ == "__main__":`. In real time `run` sleeps; in lockstep the plant takes an exact number of steps, and what
+an operator requests between two of them holds from the next tick on, so a test repeats bit for bit on a busy machine.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from threading import Condition
 from typing import Any, Final, Self
 
-import zenoh
 from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
@@ -23,19 +21,17 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Gains, Hold, Inject, Message, Reference, Request, Track
 from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.host.operator import send, stop
 from aeroloop.service.points_file import read_points
-from aeroloop.service.testing.hil_log import HilError as HilError
 from aeroloop.service.testing.hil_log import HilLog as HilLog
-from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import PATIENCE_S, ProcessGroup, RoleName, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import HilError as HilError
 
 PLANTS: Final = ("emulator", "can", "can-node", "quanser")
 """Plant ends by name; any other name is of a plant, which the emulator runs."""
 
-ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
-PATIENCE_S: Final = 30.0
-"""Timeout for another process: one starts in about a second here, and CI machines are busy."""
 PATIENCE_PER_STEP_S: Final = 0.02
 """Timeout per step in lockstep: a hundred times what a step takes here."""
 
@@ -64,11 +60,8 @@ class Hil:
         self._processes: ProcessGroup | None = None
         self._running = False
         self._logs: list[HilLog] = []
-        self._changed = Condition()
-        self._statuses: dict[str, Status] = {}
         self._may_query: defaultdict[str, float] = defaultdict(float)  # of each topic, from when on
         self._requested_ticks = 0
-        self.events: list[Event] = []
 
     def __enter__(self) -> Self:
         return self
@@ -110,20 +103,11 @@ class Hil:
         if self._private_bus:
             loaded = loaded.model_copy(update={"can": private_bus(loaded.can)})
         self._settings = loaded
-        self.events.clear()
-        self._statuses.clear()
         self._requested_ticks = 0
         self._processes = ProcessGroup(loaded, log.with_suffix(""))
         self._running = True
         self._logs.append(HilLog(log))
-        for name, receive in (("event", self._receive_event), ("status", self._receive_status)):
-            self.processes.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), receive)
-        self.processes.start("recorder")
-        self.processes.start_plant()
-        if drive:
-            self.processes.start("controller")  # it waits for the recorder before it claims
-        for role in ROLES:
-            self.processes.await_role(role)
+        self.processes.start_loop(drive=drive)
         if drive:
             self.eventually("the controller drives the plant", self._closed)
 
@@ -133,8 +117,7 @@ class Hil:
         In lockstep an emulator stops between two calls; other plants run on, so they take at least that many steps.
 
         Raises:
-            ProcessGroupError: A process has failed.
-            HilError: In lockstep, the plant does not step in time.
+            HilError: A process has failed or, in lockstep, the plant does not step in time.
         """
         self._check_running()
         if not self._lockstep:
@@ -146,7 +129,7 @@ class Hil:
             self._query("advance", Advance(seconds=seconds))
 
         def over() -> bool:
-            plant = self._statuses.get("plant")
+            plant = self.processes.statuses.get("plant")
             return plant is not None and (plant.ticks >= self._requested_ticks or plant.session is None)
 
         patience_s = PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds)
@@ -218,16 +201,21 @@ class Hil:
         if role != "controller":
             self.processes.await_role(role)
 
+    @property
+    def events(self) -> list[Event]:
+        """Events received so far, in order."""
+        return self.processes.events
+
     def state(self, role: str) -> str | None:
         """State of `plant`, `controller` or `recorder` in its last status; None before the first."""
-        status = self._statuses.get(role)
+        status = self.processes.statuses.get(role)
         return status.state if status else None
 
     def status(self, role: str) -> Status:
         """The last status of a role. Raises HilError before the first."""
-        if role not in self._statuses:
+        if role not in self.processes.statuses:
             raise HilError(f"no status received from the {role}")
-        return self._statuses[role]
+        return self.processes.statuses[role]
 
     def happened(self, kind: str, text: str = "") -> bool:
         """Whether an event of this kind, with this in its text, was received."""
@@ -235,17 +223,7 @@ class Hil:
 
     def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
         """Wait until a condition on the loop holds. Raises HilError if it does not hold in time."""
-        deadline = time.monotonic() + timeout_s
-        with self._changed:
-            while not condition():
-                if time.monotonic() > deadline:
-                    states = ", ".join(f"{role} {status.state}" for role, status in sorted(self._statuses.items()))
-                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
-                    raise HilError(
-                        f"not within {timeout_s:g} s: {what} ({states or 'no status was received'}"
-                        f"{f'; last events: {last}' if last else ''})"
-                    )
-                self._changed.wait(0.05)
+        self.processes.eventually(what, condition, timeout_s)
 
     def finish(self) -> None:
         """Stop all processes and close the log."""
@@ -287,7 +265,7 @@ class Hil:
 
     def _closed(self) -> bool:
         """Whether the controller drives the plant; in lockstep, whether both ends have begun a session."""
-        plant, controller = self._statuses.get("plant"), self._statuses.get("controller")
+        plant, controller = map(self.processes.statuses.get, ("plant", "controller"))
         if not self._lockstep or plant is None or controller is None:
             return plant is not None and plant.state == PlantState.DRIVEN
         return plant.session is not None and plant.session == controller.session
@@ -300,9 +278,7 @@ class Hil:
         try:
             return model.model_validate(values)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise HilError(f"{where}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}") from None
+            raise HilError(problem(error, model)) from None
 
     def _operate(self, topic: str, message: Message) -> str:
         self._check_running()
@@ -324,14 +300,3 @@ class Hil:
                     raise HilError(answer.text)
                 return
         raise HilError(f"no answer to {topic!r}")
-
-    def _receive_event(self, sample: zenoh.Sample) -> None:
-        with self._changed:
-            self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
-            self._changed.notify_all()
-
-    def _receive_status(self, sample: zenoh.Sample) -> None:
-        status = Status.model_validate_json(sample.payload.to_bytes())
-        with self._changed:
-            self._statuses[status.role] = status
-            self._changed.notify_all()

@@ -8,17 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mcap.reader import make_reader
 
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Percentiles
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
 from aeroloop.service.figures import Figures, StreamFigures
 from aeroloop.service.review.review import report, review
-
-
-class HilError(AeroloopError):
-    """The loop did not reach a state that the test requires; one line."""
+from aeroloop.service.testing.process_group import HilError
 
 
 class _Present:

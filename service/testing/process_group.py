@@ -1,50 +1,118 @@
-"""Process group: starts and stops roles as child processes, for the demo and the tests.
+"""Process group: starts, watches and stops roles as child processes, for the demo and the tests.
 
-Each child runs the command that a user would type, with the effective configuration in a temporary file. A child ends
-when its parent ends. ^C reaches only the parent, which stops its children one by one.
+Each child runs the command that a user would type, with the effective configuration in a temporary file. It is a fork
+of multiprocessing's server, which has imported everything, because imports take over half a second of a core. A child
+ends when this process ends, however that ends. ^C reaches only this process, which stops its children one by one.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from random import randrange
+from runpy import run_module
+from threading import Condition, Thread
 from typing import Any, Final, Literal, Self, get_args
 
 import zenoh
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Status, Telemetry
 from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.transport.network import POLL_S, join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.probe import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
-from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
 
 RoleName = Literal["controller", "plant", "can-node", "recorder", "router"]
 
-Child = subprocess.Popen[bytes] | ForkedProcess
-
+PRELOADED: Final = (
+    "aeroloop.service.cli.main",
+    "aeroloop.service.daemon.daemon",
+    "aeroloop.service.daemon.roles",
+    "aeroloop.service.recording.recorder",
+    "aeroloop.service.terminal.log_lines",
+    "aeroloop.service.testing.process_group",
+    "aeroloop.service.theorem.any_law",
+    "aeroloop.service.viewers.channels",
+    "aeroloop.plant_emulator.hosts.can_node",
+    "casadi",  # the modules above import it at its first use
+)
+"""Modules that the fork server imports, once for all children."""
 _BLOCKS: Final = 10_000, 32_000
 """Ports to choose blocks from: below those that the system gives out by itself."""
-
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
+PATIENCE_S: Final = 30.0
+"""Timeout for a state of the loop: a process starts in about a second here, and CI machines are busy."""
 
 
-class ProcessGroupError(AeroloopError):
-    """A process did not start or ended early; one line with its last warning or error."""
+class HilError(AeroloopError):
+    """A process did not start or ended early, or the loop did not reach a required state; one line."""
+
+
+def start_command(words: Sequence[str], output: Path, environment: Mapping[str, str] | None = None) -> BaseProcess:
+    """Run `aeroloop` with these words in a process and a session of its own; its stderr goes to the end of a file.
+
+    With additions to the environment it is a new interpreter, because the dynamic linker reads them at its start;
+    without, it is a fork of the server. Variables of the configuration are not passed on.
+    """
+    multiprocessing.set_forkserver_preload([*PRELOADED])
+    context: Any = multiprocessing.get_context("spawn" if environment else "forkserver")
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
+    given = {**inherited, **(environment or {})}
+    process: BaseProcess = context.Process(
+        target=_run_command, args=([*words], output, given, os.getcwd()), daemon=True
+    )
+    # NumPy would start threads at its import, before the command blocks the signals that its own thread waits for.
+    with _environment({"OPENBLAS_NUM_THREADS": "1", **(environment or {})}):
+        process.start()
+    return process
+
+
+@contextmanager
+def _environment(additions: Mapping[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in additions}
+    os.environ.update(additions)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _run_command(words: list[str], output: Path, environment: Mapping[str, str], folder: str) -> None:
+    os.setsid()
+    with output.open("ab") as stderr, open(os.devnull, "wb") as null:
+        os.dup2(null.fileno(), 1)
+        os.dup2(stderr.fileno(), 2)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # in the thread, which handles none
+    Thread(target=_follow_parent, daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    sys.argv[1:] = words
+    run_module("aeroloop", run_name="__main__")
+
+
+def _follow_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def free_rendezvous() -> str:
@@ -79,10 +147,10 @@ def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
     """The settings of a loop that arms and moves by itself and records to a new log, on a free rendezvous and bus.
 
     Raises:
-        ProcessGroupError: The log exists.
+        HilError: The log exists.
     """
     if parts(log):
-        raise ProcessGroupError(f"{log} exists, and a log is never written over; name another with --log PATH")
+        raise HilError(f"{log} exists, and a log is never written over; name another with --log PATH")
     controller |= {"require_recorder": True, "auto_arm": True, "after_restart": "configured"}
     return settings.model_copy(
         update={
@@ -98,7 +166,8 @@ class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
     Their configuration and output, a text file each, are kept in the folder if one is given; `zenoh` is a session on
-    their network. Clients get a router of their own.
+    their network. Clients get a router of their own. The last status of each role, every event and the last telemetry
+    are collected as they are received.
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:
@@ -110,14 +179,22 @@ class ProcessGroup:
         self._settings = settings = settings.model_copy(update={"plant": plant})
         self._config = self._folder / "aeroloop.toml"
         self._config.write_text(settings.toml())
-        self._children: dict[str, Child] = {}
+        self._children: dict[str, BaseProcess] = {}
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
-        self._changed = threading.Condition()
+        self._changed = Condition()
+        self.statuses: dict[str, Status] = {}
+        self.events: list[Event] = []
+        self.telemetry: Telemetry | None = None
         if settings.network.mode == "client":
-            self._start_router()
+            self.start("router")
+            while not accepting(settings.network.rendezvous_endpoints):
+                self.check()
+                time.sleep(POLL_S)
         self.zenoh = join(settings.network)  # listens, so that a process links to it as it starts
-        self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
+        for topic in ("status", "event", "telemetry"):
+            self.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), self._receive)
+        self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._receive, history=True)
 
     def __enter__(self) -> Self:
         return self
@@ -129,85 +206,82 @@ class ProcessGroup:
         self.zenoh.close()
         self._cleanup.close()
 
-    def _start_router(self) -> None:
-        self.start("router")
-        while not accepting(self._settings.network.rendezvous_endpoints):
-            self._check("router")
-            time.sleep(POLL_S)
+    def start_loop(self, *, drive: bool = True) -> None:
+        """Start recorder, plant end, a node on a bus that is software, and a controller; wait for recorder and plant.
 
-    def start_plant(self) -> None:
-        """Start the configured plant end, and a node on the bus where the bus is software."""
+        Args:
+            drive: Whether to start a controller, which claims once both are there.
+        """
+        self.start("recorder")
         if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
             self.start("can-node")
         self.start("plant")
+        if drive:
+            self.start("controller")
+        self.await_role("recorder")
+        self.await_role("plant")
 
-    def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> Child:
+    def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> BaseProcess:
         """Start a role; `await_role` waits until it is on the network.
 
         Args:
             role: The role to start.
             arguments: Further words of its command line.
-            environment: Additions to this process's environment. With them the child is a new interpreter, because the
-                dynamic linker reads them at start; without, it is a fork (see `fork_server`).
+            environment: As of `start_command`.
         """
-        inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
-        server = None if environment else fork_server()
-        parent = server.pid if server else os.getpid()
-        words = [role, "--config", str(self._config), f"--with-parent={parent}", *arguments]
-        with self._log(role).open("ab") as stderr:
-            if server:
-                child: Child = server.start(words, inherited, stderr.fileno())
-            else:
-                child = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "aeroloop", *words],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=stderr,
-                    env={**inherited, **(environment or {})},
-                    start_new_session=True,
-                )
-        self._children[role] = child
+        words = [role, "--config", str(self._config), *arguments]
+        self._children[role] = start_command(words, self._output(role), environment)
         self._killed.discard(role)
-        return child
+        return self._children[role]
 
-    def await_role(self, role: RoleName, timeout_s: float = START_WAIT_S) -> None:
-        """Wait for a role's liveliness token.
+    def await_role(self, role: RoleName) -> None:
+        """Wait for a role's liveliness token. Raises HilError if it ends, or does not join in time."""
+        self.eventually(f"the {role} joins the network", lambda: role in self._alive, START_WAIT_S)
 
-        Raises:
-            ProcessGroupError: The role ended, or the time is over.
-        """
+    def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
+        """Wait until a condition on the loop holds. Raises HilError if it does not in time, or a process failed."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while role not in self._alive:
-                self._check(role)
+            while not condition():
+                self.check()
                 if time.monotonic() > deadline:
-                    raise ProcessGroupError(f"the {role} did not join the network within {timeout_s:g} s")
-                self._changed.wait(0.1)
+                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
+                    raise HilError(
+                        f"not within {timeout_s:g} s: {what} ({self.states or 'no status was received'}"
+                        f"{f'; last events: {last}' if last else ''})"
+                    )
+                self._changed.wait(0.05)
+
+    @property
+    def states(self) -> str:
+        """The state of each role, in one line."""
+        return ", ".join(f"{role} {status.state}" for role, status in sorted(self.statuses.items()))
 
     def running(self, role: RoleName) -> bool:
         """Whether a started role still runs."""
-        return self._children[role].poll() is None
+        return self._children[role].is_alive()
 
-    def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int:
+    def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int | None:
         """Stop a role and wait for its end; kill it after `STOP_WAIT_S`. Returns its exit code."""
         self._killed.add(role)
+        self.signal(role, how)
+        self.signal(role, signal.SIGCONT)  # a paused process handles no other signal
         child = self._children[role]
-        if child.poll() is None:
-            child.send_signal(how)
-            child.send_signal(signal.SIGCONT)  # a paused process handles no other signal
-        try:
-            return child.wait(STOP_WAIT_S)
-        except subprocess.TimeoutExpired:
+        child.join(STOP_WAIT_S)
+        if child.is_alive():
             child.kill()
-            return child.wait()
+            child.join()
+        return child.exitcode
 
     def signal(self, role: RoleName, which: signal.Signals) -> None:
-        """Send a signal to a started role."""
-        self._children[role].send_signal(which)
+        """Send a signal to a started role, unless it has ended."""
+        if self.running(role):
+            with suppress(ProcessLookupError):  # ended, and its exit code is on the way
+                os.kill(self.pid(role), which)
 
     def pid(self, role: RoleName) -> int:
         """Process id of a started role."""
-        return self._children[role].pid
+        return self._children[role].pid or 0
 
     def replace_log(self, path: Path) -> None:
         """Set the path of the log for recorders started from now on."""
@@ -216,27 +290,31 @@ class ProcessGroup:
         self._config.write_text(self._settings.toml())
 
     def check(self) -> None:
-        """Raise ProcessGroupError, with its last warning or error, if any process has failed."""
-        for role in self._children:
-            self._check(role)
+        """Raise HilError, with its last warning or error, if any process has failed."""
+        for role, child in self._children.items():
+            if child.exitcode and role not in self._killed:
+                lines = self._output(role).read_text(errors="replace").strip().splitlines()
+                last = next((f": {line}" for line in reversed(lines) if " INFO " not in line), "")
+                raise HilError(f"the {role} ended with exit code {child.exitcode}{last}")
 
-    def _check(self, role: str) -> None:
-        code = self._children[role].poll()
-        if code and role not in self._killed:
-            lines = self._log(role).read_text(errors="replace").strip().splitlines()
-            last = next((f": {line}" for line in reversed(lines) if " INFO " not in line), "")
-            raise ProcessGroupError(f"the {role} ended with exit code {code}{last}")
-
-    def _log(self, role: str) -> Path:
+    def _output(self, role: str) -> Path:
         return self._folder / f"{role}.txt"
 
-    def _token(self, sample: zenoh.Sample) -> None:
-        address = topics.read_key(str(sample.key_expr))
-        if address is None or address.role is None:
+    def _receive(self, sample: zenoh.Sample) -> None:
+        address, content = topics.read_key(str(sample.key_expr)), sample.payload.to_bytes()
+        if address is None:
             return
         with self._changed:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._alive.add(address.role)
-            else:
-                self._alive.discard(address.role)
+            match address.topic.name:
+                case "status":
+                    status = Status.model_validate_json(content)
+                    self.statuses[status.role] = status
+                case "event":
+                    self.events.append(Event.model_validate_json(content))
+                case "telemetry":
+                    self.telemetry = Telemetry.model_validate_json(content)
+                case _ if address.role is not None and sample.kind == zenoh.SampleKind.PUT:
+                    self._alive.add(address.role)
+                case _ if address.role is not None:
+                    self._alive.discard(address.role)
             self._changed.notify_all()

@@ -11,7 +11,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_class, words_of
 from aeroloop.service.theorem.certificate import Certificate, Evaluated, certify, evaluate
@@ -70,15 +69,6 @@ class Promise(NamedTuple):
     certificate: Certificate | None
     bounds: Evaluated | None
     verdict: str
-
-    @property
-    def transient_s(self) -> float:
-        """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, z₂ by J⁻¹C₂ (C.22) [s].
-
-        After it an error has fallen to 5 %, but θ̃ may take much longer. Of another law, that of the paper's gains.
-        """
-        law = self.law if isinstance(self.law, AdaptiveSettings) else AdaptiveSettings()
-        return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 
 def promise(settings: Settings, changes: Sequence[Change] = (), described: Mapping[str, Any] | None = None) -> Promise:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import asin, degrees, floor, hypot, inf, radians, sin, sqrt
-from typing import Any, Final, get_type_hints
+from typing import Any, Final, NamedTuple, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -99,13 +99,21 @@ class Certificate(BaseModel):
         return {term.symbol: term.value for term in self.terms}[symbol]
 
 
+class Paper(NamedTuple):
+    """What the paper says of its law: inputs, Lemma 1, Theorem 1."""
+
+    known: Known
+    lemma: Lemma
+    theorem: Theorem
+
+
 @dataclass(frozen=True)
 class Evaluated:
     """The quantities of a certificate, to check a run against.
 
     Attributes:
         desired: The reference's extremes.
-        paper: Inputs, Lemma 1 and Theorem 1 of the paper's law; None of another.
+        paper: What the paper says of its law; None of another.
         body: Premises of the paper's body.
         plant: Premises of the configured plant.
         body_reach: What the paper's body reaches; None where nothing is proven.
@@ -114,7 +122,7 @@ class Evaluated:
     """
 
     desired: Extremes
-    paper: tuple[Known, Lemma, Theorem] | None
+    paper: Paper | None
     body: Premises
     plant: Premises
     body_reach: Reach | None
@@ -150,7 +158,7 @@ def evaluate(
         angles = [radians(min(180.0, start_deg)), *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at)]
         known = _known(settings, settings.law, desired, body, max(angles))
         lemma = lemma_1(known)
-        paper = known, lemma, theorem_1(known, lemma)
+        paper = Paper(known, lemma, theorem_1(known, lemma))
     return Evaluated(desired, paper, body, plant, body_reach, plant_reach, bounds)
 
 
@@ -252,7 +260,7 @@ def certify(
     constant = (
         reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else e.plant_reach
     )
-    known, lemma, t = e.paper or (None, None, None)
+    t = e.paper and e.paper.theorem
     return Certificate(
         holds=not violated,
         **{name: getattr(t, name, None) for name in ("margin", "c0", "delta_V1", "delta_V2", "k", "radius")},
@@ -266,7 +274,7 @@ def certify(
         lost_frames=None if delay is None else floor(delay / settings.loop.period),
         assumptions=_assumptions(settings, e, disturbance),
         violated=violated,
-        terms=[*(term for part in (known, lemma, t) if part for term in _terms(part)), *_reach_terms(e.plant_reach)],
+        terms=[*(term for part in e.paper or () for term in _terms(part)), *_reach_terms(e.plant_reach)],
     )
 
 
@@ -357,7 +365,7 @@ def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) ->
     law = e.plant.law
     found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
     paper = (
-        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper[0].half_angle_e):g}° (--attitude-error)"]
+        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}° (--attitude-error)"]
         if e.paper
         else []
     )

@@ -130,7 +130,7 @@ class Reach:
 
 def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
-    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * p.delta_omega
+    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * (p.delta_omega + p.encoder.ripple)
     return Reach(axis_rate=p.axis_rate, half_angle=p.half_angle_d, noise=torque, deviation=torque)
 
 
@@ -226,7 +226,9 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     delta_q = p.delta_q(asin(eps_e))
     delta_R = 2 * delta_q
     delta_omega = p.delta_omega + p.encoder.turn * omega
-    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega)
+    delta_omega += p.encoder.angle * axis_omega + p.encoder.lag * (
+        p.k_omega_d_dot + omega_e * p.k_omega_d + axis_omega * omega
+    )
     filtered = p.encoder.lag * omega_e_dot  # what the linear equations have of the filter only for k_d, c and θ̂(t₀)
     delta_omega_e = delta_omega + delta_R * p.k_omega_d
     if len(set(law.kp)) == len(set(law.kd)) == 1:  # parts of one error at right angles to each other
@@ -267,7 +269,8 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     if p.tilt is not None:
         fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
     d4 = delta_omega_e + share * delta_q + p.period * (omega_e_dot + share * at["eps_dot"])
-    gap = at["gap"] + p.lag * rest_dot + 2 * (noise + steady * p.encoder.ripple)
+    gap = at["gap"] + p.lag * rest_dot + 2 * noise + steady * p.encoder.ripple
+    gap += 2 * steady * p.encoder.angle / p.lag if p.lag else 0.0
     d5 = noise + ki * p.encoder.angle + hold + p.uneven * gap
     deviation = (
         at["feedback"] + slow + noise + steady * p.encoder.ripple + law.estimate * axis_omega + p.weight * 2 * eps_e

@@ -26,7 +26,6 @@ from aeroloop.protocol.transport.can_format import (
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
     HEARTBEAT_S,
-    MAX_NODE,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     carried_bytes,
@@ -35,21 +34,15 @@ from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import LogarithmicQuantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
-_MAX_CYCLE_MS: Final = 2**16 - 1  # what cantools declares for GenMsgCycleTime
 _SAME_STEP: Final = 1e-12  # a dead zone this near to l/2, relatively, shifts no level by more than 1e-12 l
 
 
 def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
-    """The DBC file of a plant's node, 1…127, and the controller that drives it. `period_ns` is the plant grid's [ns].
+    """The DBC file of a plant's node and the controller that drives it. `period_ns` is the plant grid's [ns].
 
-    Raises:
-        ValueError: A node or a period out of bounds.
+    Raises CanError if a frame is longer than CAN FD's.
     """
-    if not 1 <= node <= MAX_NODE:
-        raise ValueError(f"a node's number is 1 to {MAX_NODE}, not {node}")
     cycle_ms, beat_ms = -(-period_ns // 1_000_000), round(1000 * HEARTBEAT_S)
-    if not 1 <= cycle_ms <= _MAX_CYCLE_MS:
-        raise ValueError(f"a period of {period_ns} ns is not between 1 ns and {_MAX_CYCLE_MS} ms")
     every = (
         f"one every {period_ns} ns ({1e9 / period_ns:.6g} Hz; the cycle time is in whole ms, rounded up). Every bit "
         "that belongs to no signal must be 0."

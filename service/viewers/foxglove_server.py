@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from threading import Event
-from time import time_ns
 from typing import Final
 
 import foxglove
@@ -54,10 +53,9 @@ class LiveDecoder:
     def take(self) -> Iterator[Decoded]:
         """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
         for description in self._descriptions.take():
-            published_ns = description.published_ns or time_ns()
-            if published_ns < self._described.get(description.key, 0):
+            if description.published_ns < self._described.get(description.key, 0):
                 continue  # recovered after a newer one
-            self._described[description.key] = published_ns
+            self._described[description.key] = description.published_ns
             try:
                 self._decoder.configure(Description.decode(description.payload))
             except MessageError:
@@ -68,8 +66,7 @@ class LiveDecoder:
                     break
                 received = read_sample(sample)
                 if address := topics.read_key(received.key):
-                    at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
-                    yield from self._decoder.take(address, received.payload, at_ns)
+                    yield from self._decoder.take(address, received.payload, received.published_ns)
 
 
 class FoxgloveServer:

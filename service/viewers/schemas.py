@@ -1,37 +1,35 @@
-"""Schemas of MCAP and WebSocket channels: what viewers show, and the JSON messages of the network.
+"""What viewers show: schemas of MCAP and WebSocket channels, the views in people's units, and a layout of panels.
 
 Lichtblick rejects a channel whose JSON schema has a `$ref`, an `anyOf`, a null or an array of arrays (its
-parseJsonSchema.ts). So a view is a flat table of fields, and a model's schema is inlined and reduced: a nullable field
-has the schema of its other type, and a field that cannot be described is left out of the schema, not of the messages.
+parseJsonSchema.ts). So a model's schema is inlined and reduced: a nullable field has the schema of its other type, and
+a field that cannot be described is left out of the schema, not of the messages.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, create_model
 
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
 if TYPE_CHECKING:  # recorder and reader of logs do without
     import foxglove
 
+MOTORS: Final = range(1, MAX_ACTUATORS + 1)
 _KEPT: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
 
 
 class Shape(NamedTuple):
-    """Schema of a topic's messages, by name and encoding (`protobuf` or `jsonschema`), and the messages' encoding.
-
-    `fields` are the names of a view's values, in order.
-    """
+    """Schema of a topic's messages, by name and encoding (`protobuf` or `jsonschema`), and the messages' encoding."""
 
     name: str
     encoding: str
     schema: bytes
     message_encoding: str
-    fields: tuple[str, ...] = ()
 
 
 class Decoded(NamedTuple):
@@ -48,97 +46,10 @@ def protobuf_shape(schema: foxglove.Schema) -> Shape:
     return Shape(schema.name, schema.encoding, schema.data, "protobuf")
 
 
-# ── views: what is shown, in degrees, volts and microseconds ──
-
-
-_Field = str | tuple[str, str]
-"""Description of a number, or type and description."""
-
-
-def _view(name: str, about: str, fields: Mapping[str, _Field]) -> Shape:
-    """A view of these fields; any value may be null."""
-    properties = {}
-    for field, described in fields.items():
-        kind, text = ("number", described) if isinstance(described, str) else described
-        properties[field] = {"type": kind, "description": text} if text else {"type": kind}
-    schema = {"type": "object", "properties": properties, "description": about}
-    data = json.dumps(schema, ensure_ascii=False).encode()
-    return Shape(f"aeroloop.{name}", "jsonschema", data, "json", tuple(fields))
-
-
-_ANGLES: Final = "Z–Y–X, body relative to inertial"
-_NO_MOTOR: Final = "null: no valid value, or no such motor"
-_SATURATED: Final = "is at the quantizer's outermost level"
-_MOTORS: Final = list(zip(range(1, MAX_ACTUATORS + 1), "₁₂₃₄₅₆₇₈", strict=True))
-
-
-def _angles(prefix: str = "", text: str = _ANGLES, yaw: str = ", −180…180") -> dict[str, str]:
-    return {
-        f"{prefix}roll_deg": f"{text} [deg]",
-        f"{prefix}pitch_deg": f"{text} [deg]",
-        f"{prefix}yaw_deg": f"{text}{yaw} [deg]",
-    }
-
-
-ATTITUDE: Final = _view(
-    "Attitude",
-    "Attitude and rates.",
-    _angles()
-    | {f"{rate}_deg_s": f"rate about the body's {axis} axis [deg/s]" for rate, axis in zip("pqr", "xyz", strict=True)},
-)
-SETPOINT: Final = _view("Setpoint", "An operator's set-point.", _angles(yaw=""))
-VOLTAGES: Final = _view(
-    "Voltages",
-    "Voltages as commanded, quantized.",
-    {f"voltage_{i}_v": f"u{sub}; {_NO_MOTOR} [V]" for i, sub in _MOTORS}
-    | {f"saturated_{i}": ("boolean", f"u{sub} {_SATURATED}; {_NO_MOTOR}") for i, sub in _MOTORS},
-)
-TRACKING: Final = _view(
-    "Tracking",
-    "How well the body follows its reference, as the controller saw it at one tick.",
-    {
-        "time_s": "on the law's clock; null if its period is not known [s]",
-        "error_deg": "angle from the desired to the measured attitude, 0…180 [deg]",
-        **_angles("", f"measured; {_ANGLES}"),
-        **_angles("desired_"),
-        "error_p_deg_s": "ω_e about the body's x axis [deg/s]",
-        "error_q_deg_s": "ω_e about the body's y axis [deg/s]",
-        "error_r_deg_s": "ω_e about the body's z axis [deg/s]",
-        "damping_1": "θ̂₁; null with another law than the paper's [N·m·s/rad]",
-        "damping_2": "θ̂₂ [N·m·s/rad]",
-        "damping_3": "θ̂₃ [N·m·s/rad]",
-        "sign": ("integer", "the equilibrium approached, z₁₊ or z₁₋; null with a law that has none"),
-    },
-)
-STATUS: Final = _view(
-    "RoleStatus",
-    "Status of a role. Percentiles are of the last ten seconds.",
-    {
-        "state": ("string", ""),
-        "cause": ("string", "plant: why it may not be driven, where that is so"),
-        "session": ("string", ""),
-        "rate_hz": "ticks (recorder: messages) a second since the last status [Hz]",
-        "skipped": ("integer", "grid ticks of the session that were missed"),
-        "refused": ("integer", "malformed frames since start"),
-        "stale": ("integer", "frames since start that were received too late to be acted upon"),
-        "saturated": ("integer", "values beyond a quantizer's range since start"),
-        "latency_p50_us": "plant: from a measurement to the command that answers it [µs]",
-        "latency_p99_us": "the same, 99th percentile [µs]",
-        "age_p50_us": "controller: how much later than the fastest a measurement was received [µs]",
-        "age_p99_us": "the same, 99th percentile [µs]",
-        "wake_p50_us": "from when a tick was due to when it began [µs]",
-        "wake_p99_us": "the same, 99th percentile [µs]",
-        "uptime_s": "since it joined the network [s]",
-    },
-)
-
-
-# ── JSON messages of the network, as they are recorded ──
-
-
-def json_shape(name: str, model: type[BaseModel]) -> Shape:
+def json_shape(model: type[BaseModel]) -> Shape:
     """The shape of a model's JSON."""
-    return Shape(name, "jsonschema", json.dumps(plain_schema(model), ensure_ascii=False).encode(), "json")
+    schema = json.dumps(plain_schema(model), ensure_ascii=False).encode()
+    return Shape(f"aeroloop.{model.__name__}", "jsonschema", schema, "json")
 
 
 def plain_schema(model: type[BaseModel]) -> dict[str, Any]:
@@ -152,13 +63,10 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
     kept = {key: schema[key] for key in _KEPT if key in schema}
     if "$ref" in schema:
         return _plain({**definitions[schema["$ref"].rpartition("/")[2]], **kept}, definitions)
-    alternatives = [one for one in schema.get("anyOf") or schema.get("oneOf") or [] if one.get("type") != "null"]
+    alternatives = [one for one in schema.get("anyOf", []) if one.get("type") != "null"]
     if alternatives:
-        found = [_plain(one, definitions) for one in alternatives]
-        if all(one is not None and one["type"] == "object" for one in found):
-            together = {name: field for one in found if one for name, field in one["properties"].items()}
-            return {"type": "object", "properties": together, **kept}
-        return {**found[0], **kept} if len(found) == 1 and found[0] else None
+        only = _plain(alternatives[0], definitions) if len(alternatives) == 1 else None
+        return only and {**only, **kept}
     match schema.get("type"):
         case "object":
             fields = {name: _plain(field, definitions) for name, field in schema.get("properties", {}).items()}
@@ -170,3 +78,67 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
             return {"type": kind, **kept}
         case _:
             return None
+
+
+# ── views; any value may be null ──
+
+_Number = float | None
+
+
+class Attitude(BaseModel):
+    """Attitude and rates."""
+
+    roll_deg: _Number = Field(description="Z–Y–X, body relative to inertial [deg]")
+    pitch_deg: _Number = Field(description="likewise [deg]")
+    yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
+    p_deg_s: _Number = Field(description="rate about the body's x axis [deg/s]")
+    q_deg_s: _Number = Field(description="rate about the body's y axis [deg/s]")
+    r_deg_s: _Number = Field(description="rate about the body's z axis [deg/s]")
+
+
+Voltages: Final[type[BaseModel]] = create_model(
+    "Voltages",
+    __doc__="Voltages as commanded, quantized; null: no valid value, or no such motor.",
+    **{f"voltage_{i}_v": (_Number, Field(None, description=f"u{i} [V]")) for i in MOTORS},
+    **{f"saturated_{i}": (bool | None, Field(None, description="is at the outermost level")) for i in MOTORS},
+)  # type: ignore[call-overload]  # fields by their names
+
+
+class Tracking(BaseModel):
+    """How well the body follows its reference, as the controller saw it at one tick."""
+
+    time_s: _Number = Field(description="on the law's clock; null if its period is not known [s]")
+    error_deg: _Number = Field(description="angle from the desired to the measured attitude, 0…180 [deg]")
+    roll_deg: _Number = Field(description="measured; Z–Y–X, body relative to inertial [deg]")
+    pitch_deg: _Number = Field(description="likewise [deg]")
+    yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
+    desired_roll_deg: _Number = Field(description="Z–Y–X, body relative to inertial [deg]")
+    desired_pitch_deg: _Number = Field(description="likewise [deg]")
+    desired_yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
+    error_p_deg_s: _Number = Field(description="ω_e about the body's x axis [deg/s]")
+    error_q_deg_s: _Number = Field(description="ω_e about the body's y axis [deg/s]")
+    error_r_deg_s: _Number = Field(description="ω_e about the body's z axis [deg/s]")
+    damping_1: _Number = Field(description="θ̂₁; null with another law than the paper's [N·m·s/rad]")
+    damping_2: _Number = Field(description="θ̂₂ [N·m·s/rad]")
+    damping_3: _Number = Field(description="θ̂₃ [N·m·s/rad]")
+    sign: int | None = Field(description="the equilibrium approached, z₁₊ or z₁₋; null with a law that has none")
+
+
+# ── panels ──
+
+
+def layout(vehicle: str, motors: range) -> str:
+    """A layout for Foxglove and Lichtblick, as JSON to import; `motors` are the numbers of those there are.
+
+    Both read `configById` with a panel's settings under `Type!name`, and `layout`, a tree of splits. The keys of the
+    settings are those of Lichtblick's sources (suite-base/src/panels: 3D, Plot, StateTransitions, and Log, whose type
+    is still RosOut); both ignore unknown keys. Plots show 20 s of a live loop, and all of a log.
+    """
+    text = files(__package__).joinpath("layout.json").read_text(encoding="utf-8")
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", vehicle):  # in a message path, such a topic is quoted
+        text = re.sub(r'"value": "(/VEHICLE/[^.]+)\.', r'"value": "\\"\1\\".', text)
+    tree = json.loads(text.replace("VEHICLE", vehicle))
+    voltages = tree["configById"]["Plot!voltages"]
+    first = json.dumps(voltages["paths"][0])
+    voltages["paths"] = [json.loads(first.replace("_1_", f"_{i}_").replace('"u1"', f'"u{i}"')) for i in motors]
+    return json.dumps(tree, indent=2, ensure_ascii=False)

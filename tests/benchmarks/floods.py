@@ -2,8 +2,7 @@
 
 Plant, controller and recorder run at 500 Hz with the default settings, open to strangers, who flood each topic of the
 table in turn: garbage, nested JSON, as many unknown keys as fit, what is longer than allowed, 1 MB, and well-formed
-messages, to keys with and without wildcards. Each flood takes turns with as long a stretch in which nobody floods, and
-one in which the same strangers flood a bystander: what they take of the machine they share with the loop is in both.
+messages, to keys with and without wildcards. Each flood takes turns with as long a stretch in which nobody floods.
 Printed are the ticks that each end skipped, and by how much its memory grew.
 """
 
@@ -33,15 +32,14 @@ from aeroloop.protocol.messages.topics import Topic
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings
-from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, standalone
-from tests.benchmarks.loop import memory_mb
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
+from tests.benchmarks.loop import NO_SCOUTING, memory_mb
 from tests.support.zenoh_network import eventually
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 SECONDS: Final = 4.0
 LINKED_S: Final = 0.5
 """A stranger is linked to all processes within this time."""
-NO_SCOUTING: Final = {"scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}}}
 GAINS: Final = Gains(C1=(2.0, 2.0, 2.0), C2=(0.1, 0.1, 0.1), Gamma=(0.05, 0.05, 0.05))
 WELL_FORMED: Final = {
     "claim": Claim(controller="stranger", session="stranger", period_ns=2_000_000, lockstep=False, wire=WireSpec()),
@@ -109,12 +107,6 @@ def flood(rendezvous: str, name: str, seconds: float) -> None:
         os._exit(0)  # not after what still waits to be sent
 
 
-def start(endpoint: str, name: str, seconds: float) -> subprocess.Popen[bytes]:
-    """A stranger, with an interpreter of its own."""
-    words = ["flood", endpoint, name, str(seconds)]
-    return subprocess.Popen([sys.executable, "-m", "tests.benchmarks.floods", *words])
-
-
 class Ends:
     """Skipped ticks and memory of the loop's processes, once the plant is driven."""
 
@@ -133,7 +125,7 @@ class Ends:
         self._received.clear()
         eventually("a status of each", lambda: self._received.keys() >= {*ROLES})
         return {
-            role: (status.skipped, memory_mb(int(status.process.rpartition(" ")[2]))[0])
+            role: (status.skipped, memory_mb(int(status.process.rpartition(" ")[2])))
             for role, status in self._received.items()
         }
 
@@ -145,59 +137,29 @@ class Ends:
 
 
 def main(seconds: float, flooders: int, names: list[str]) -> None:
-    """Flood topic by topic, and print three lines for each."""
-    bystander = free_rendezvous()
-    words = [sys.executable, "-m", "tests.benchmarks.floods", "bystander", bystander]
+    """Flood topic by topic, each time after a quiet stretch, and print a line for each."""
     with tempfile.TemporaryDirectory() as folder:
         settings = standalone(Settings(), Path(folder) / "log.mcap")
         with ProcessGroup(settings) as processes:
             for role in ROLES:
                 processes.start(role, environment={"PYTHONUNBUFFERED": "1"})  # an interpreter of its own
             ends = Ends(processes, settings.vehicle)
-            aside = subprocess.Popen(words)
             os.nice(19)  # it watches tokens, too
-            try:
-                targets = {"bystander": bystander, "flooded": settings.network.rendezvous[0]}
-                in_turns(ends, targets, seconds, flooders, names)
-            finally:
-                aside.kill()
-                aside.wait()
-
-
-def in_turns(ends: Ends, targets: dict[str, str], seconds: float, flooders: int, names: list[str]) -> None:
-    """Floods, topic by topic and target by target, each time after a quiet stretch."""
-    time.sleep(seconds)
-    ends.since()
-    for name in names:
-        for title, rendezvous in {"quiet": None, **targets}.items():
-            strangers = [start(rendezvous, name, seconds) for _ in range(flooders)] if rendezvous else []
-            if not strangers:
+            time.sleep(seconds)
+            ends.since()
+            for name in names:
                 time.sleep(seconds)
-            for stranger in strangers:
-                stranger.wait()
-            print(f"{name:12} {title:10} {ends.since()}", flush=True)
-
-
-def stand_by(endpoint: str) -> None:
-    """A process with the loop's topics that is no part of the loop."""
-    os.nice(19)
-    tree = {"listen": {"endpoints": [endpoint]}, **NO_SCOUTING}
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-        for topic in topics.TOPICS.values():
-            if topic.kind == "query":
-                session.declare_queryable(topics.key(topic.name, "*"), RingChannel(1))
-            else:
-                session.declare_subscriber(topics.key(topic.name, "*"), RingChannel(1))
-        while True:
-            time.sleep(60)
+                print(f"{name:12} {'quiet':10} {ends.since()}", flush=True)
+                words = ["flood", settings.network.rendezvous[0], name, str(seconds)]
+                command = [sys.executable, "-m", "tests.benchmarks.floods", *words]
+                for stranger in [subprocess.Popen(command) for _ in range(flooders)]:
+                    stranger.wait()
+                print(f"{name:12} {'flooded':10} {ends.since()}", flush=True)
 
 
 if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["flood", endpoint, name, seconds]:
-            flood(endpoint, name, float(seconds))
-        case ["bystander", endpoint]:
-            stand_by(endpoint)
-        case given:
-            seconds, flooders = (*given[:2], *(str(SECONDS), "1")[len(given[:2]) :])
-            main(float(seconds), int(flooders), given[2:] or list(topics.TOPICS))
+    if sys.argv[1:2] == ["flood"]:
+        flood(sys.argv[2], sys.argv[3], float(sys.argv[4]))
+    else:
+        seconds, flooders, *chosen = [*sys.argv[1:], *(str(SECONDS), "1")[len(sys.argv[1:3]) :]]
+        main(float(seconds), int(flooders), chosen or list(topics.TOPICS))

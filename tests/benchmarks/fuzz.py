@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of what strangers send: `uv run --with atheris python -m tests.benchmarks.fuzz PART`.
 
 PART is `frames`, `messages` or `batches`; further words are libFuzzer's, such as `-max_total_time=60`. What is given is
-parsed as in `hostile.py`, and must be refused or taken: any exception but the one that is promised ends the run with
+parsed, and must be refused or taken: any exception but the one that is promised ends the run with
 the bytes that caused it. Not a dependency: atheris has no wheels for every Python.
 """
 

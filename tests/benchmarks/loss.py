@@ -23,7 +23,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from tests.benchmarks.record import cpu_s
+from tests.benchmarks.loop import cpu_s
 from tests.support.certificates import Authority
 from tests.support.namespaces import RECOVERY_S, Hosts
 from tests.support.zenoh_network import eventually

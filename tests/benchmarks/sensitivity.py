@@ -9,9 +9,8 @@ eight figures of Table C.4, which scatter as the published cells do about their 
 import numpy as np
 
 from aeroloop.service.config import load
-from aeroloop.service.lab import paper
-from aeroloop.service.lab.tables import CASES, Cell, run_cells
-from aeroloop.service.lab.workers import open_workers, run_of
+from aeroloop.service.lab.sweep import open_workers, run_of
+from aeroloop.service.lab.tables import CASES, OUTPUT_BITS, U_TOTAL, WIND, Z_TRACK, Cell, run_cells
 
 PLANT = load().plant
 PITCH, YAW = PLANT.friction.coulomb
@@ -34,7 +33,7 @@ SCALE = np.array([0.0037, 0.0038, 0.01, 0.01, 2.5])
 KEYS = "friction.coulomb=[{p}, {}]|aero.centre_of_mass=[0, 0, {}]|wind.torque=[{}, {}]|rotor.dead_zone_v={}"
 SCATTER = 0.088, 0.011
 """Standard deviation of the cells of C.2 and C.3 about their column means, as a part of these [1]."""
-TABLE_C4 = np.array([list(paper.WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
+TABLE_C4 = np.array([list(WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
 
 
 def main() -> None:
@@ -42,7 +41,7 @@ def main() -> None:
     x = np.array([YAW, PLANT.aero.centre_of_mass[2], *PLANT.wind.torque, 0.0])
     steps = [x, *(x + np.diag(0.1 * SCALE))]
     probes = [[f"plant.{key}" for key in KEYS.format(*p, p=PITCH).split("|")] for p in steps]
-    row = [Cell(out, 7) for out in paper.OUTPUT_BITS] + [Cell(8, 6, windy=True)]
+    row = [Cell(out, 7) for out in OUTPUT_BITS] + [Cell(8, 6, windy=True)]
     corners = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
     with open_workers() as workers:
         changed = [run_of(load(overrides=o), cell.overrides) for o in CHANGES.values() for cell in row]
@@ -50,7 +49,7 @@ def main() -> None:
         tables, fits = np.array(run_cells(workers, changed)), np.array(run_cells(workers, fitted))
     fits = fits.reshape(len(probes), len(corners), 2)
     for name, (*calm, windy) in zip(CHANGES, tables.reshape(-1, len(row), 2), strict=True):
-        published = np.array([paper.Z_TRACK, paper.U_TOTAL])  # the last of each is fitted
+        published = np.array([Z_TRACK, U_TOTAL])  # the last of each is fitted
         errors = np.abs(np.array(calm).T[:, None] / published - 1).reshape(2, -1)[:, :-1].mean(axis=1)
         print(f"{name:34s} {errors[0]:6.1%} {errors[1]:7.2%} {np.abs(windy / TABLE_C4[3] - 1).mean():6.1%}")
     J = ((fits[1:] - fits[0]) / TABLE_C4 / SCATTER / 0.1).reshape(len(x), -1).T

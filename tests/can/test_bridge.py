@@ -23,7 +23,7 @@ from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import LoopSettings
-from tests.support.can_in_process import virtual
+from tests.support.can_in_process import Flaws, virtual
 from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
@@ -95,10 +95,11 @@ class Ends:
         """The state that the node last received from the bridge."""
         return self.node.peer.state if self.node.peer else None
 
-    def trip(self) -> str:
-        """Why the bridge tripped, once it has; the node has then received idle."""
+    def trip(self, *, idle: bool = True) -> str:
+        """Why the bridge tripped, once it has; the node has then received idle, where the bus carries it."""
         eventually("the trip", lambda: any(event.kind == "tripped" for event in self.events))
-        eventually("idle on the bus", lambda: self.received_state() is PlantState.IDLE)
+        if idle:
+            eventually("idle on the bus", lambda: self.received_state() is PlantState.IDLE)
         return next(event.text for event in self.events if event.kind == "tripped")
 
     def _on_event(self, sample: zenoh.Sample) -> None:
@@ -164,13 +165,6 @@ def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed
     assert kinds == ["claim", "release"]
 
 
-def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
-    ends.hold()
-    assert ends.asker.ask("stop").done
-    assert ends.trip() == "stopped by an operator: 0 V"
-    assert "stopped by an operator" in ends.asker.refusal()
-
-
 def test_a_stop_of_the_bridge_holds_in_its_next_process_until_arm() -> None:
     with Gathering() as gathering:
         ends = Ends(gathering)
@@ -216,3 +210,18 @@ def test_it_trips_when_the_node_falls_silent_and_refuses_claims_for_it(ends: End
     assert ends.trip().startswith("node 1 has been silent for ")
     assert time.monotonic() - silent_since < 0.5 + SLACK_S
     assert ends.asker.refusal() == "node 1 is silent on the bus"
+
+
+def test_it_trips_when_the_bus_is_lost_refuses_claims_for_it_and_opens_it_again(flaws: Flaws, ends: Ends) -> None:
+    ends.hold()
+    flaws.lost = flaws.gone = True
+    assert ends.trip(idle=False) == "the bus is lost: adapter was unplugged: 0 V"
+    assert ends.asker.refusal() == "the bus is lost: adapter was unplugged"
+    eventually("an event", lambda: any("trying again twice a second" in event.text for event in ends.events))
+    flaws.lost = flaws.gone = False
+    assert ends.node.reopen()
+    ends.say(PlantState.IDLE)
+    eventually("its return", lambda: any(event.text == "the bus is open again" for event in ends.events))
+    latched = "the bus is lost: adapter was unplugged: 0 V; `aeroloop op arm` clears it"
+    eventually("the latch", lambda: ends.asker.refusal(auto_arm=False) == latched)
+    ends.hold()

@@ -9,7 +9,7 @@ import pytest
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import COMMAND_ID, CanError, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
-from tests.support.can_in_process import PAPER, Flaws, Stranger, both_ends, virtual
+from tests.support.can_in_process import PAPER, Flaws, Stranger, virtual
 from tests.support.zenoh_network import PATIENCE_S, eventually
 
 MARK = b"\1\2\3\4\5\6\7"
@@ -49,18 +49,6 @@ def test_a_bus_that_takes_no_frames_is_a_fault_after_so_many_in_a_row(
     flaws.full = True
     link.beat(Heartbeat(PlantState.IDLE, 0, MARK))
     assert link.fault == "the bus takes no frames: transmit queue is full"
-
-
-def test_other_error_frames_are_only_counted() -> None:
-    """As SocketCAN numbers them: lost arbitration, error passive, protocol violation, no acknowledgement, restarted."""
-    with both_ends(virtual()) as (plant, _, stranger):
-        for identifier in (0x2, 0x4, 0x8, 0x20, 0x100):
-            stranger.say(identifier, bytes(8), is_error_frame=True)
-        stranger.settle(plant)
-        assert plant.errors == 5
-        assert plant.fault is None
-        stranger.say(COMMAND_ID + 1, bytes(3))
-        assert plant.wait(PATIENCE_S) is not None
 
 
 @pytest.mark.parametrize(
@@ -106,21 +94,6 @@ def test_after_a_fault_nothing_is_sent_or_raised_until_the_link_is_reopened(
         stranger.settle(link)
 
 
-def test_a_bus_that_is_still_gone_can_be_tried_again_and_the_fault_stands_meanwhile(
-    flaws: Flaws, flawed: tuple[CanLink, CanSettings]
-) -> None:
-    link, _ = flawed
-    flaws.lost = flaws.gone = True
-    eventually("the fault", lambda: link.fault is not None)
-    for _ in range(3):
-        assert not link.reopen()
-        assert link.fault == "the bus is lost: adapter was unplugged"
-        link.send(bytes(7))
-    flaws.lost = flaws.gone = False
-    assert link.reopen()
-    assert link.fault is None
-
-
 @pytest.mark.parametrize("lost", [False, True])
 def test_closing_twice_does_no_harm_and_nothing_is_sent_or_received_afterwards(
     flaws: Flaws, flawed: tuple[CanLink, CanSettings], lost: bool
@@ -160,10 +133,3 @@ def test_what_cannot_be_opened_is_reported_in_one_line(
         CanLink(CanSettings(interface=interface, channel=channel, options=options), PAPER, "plant")
     assert str(refusal.value).startswith(f"cannot open the CAN bus {interface}:{channel}: ")
     assert "\n" not in str(refusal.value)
-
-
-def test_a_librarys_error_of_many_lines_is_reported_in_one(flaws: Flaws) -> None:
-    flaws.gone = True
-    with pytest.raises(CanError) as refusal:
-        CanLink(virtual(channel="x"), PAPER, "plant")
-    assert str(refusal.value) == "cannot open the CAN bus virtual:x: could not open x:"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from math import isinf
-from threading import Condition
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, CanSettings, Heartbeat
+from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual
@@ -80,12 +79,6 @@ def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specifica
             assert next_heartbeat(link)[:3] == (PlantState.IDLE, 0, MARK)
 
 
-@pytest.mark.parametrize("node", [0, 128])
-def test_a_node_number_that_would_make_another_kind_of_id_is_refused(node: int) -> None:
-    with pytest.raises(ValueError, match="node"):
-        CanSettings(node=node)
-
-
 def test_the_newest_frame_wins_and_is_given_once() -> None:
     with both_ends(virtual()) as (plant, controller, stranger):
         before = time.monotonic_ns()
@@ -99,27 +92,6 @@ def test_the_newest_frame_wins_and_is_given_once() -> None:
         assert before <= arrival.at_ns <= time.monotonic_ns()
         assert not controller.pending
         assert controller.take() is None
-
-
-def test_waiting_ends_when_a_frame_comes_and_at_the_timeout() -> None:
-    with both_ends(virtual()) as (plant, controller, _):
-        started = time.monotonic()
-        assert controller.wait(0.05) is None
-        assert time.monotonic() - started >= 0.05
-        plant.send(bytes(7))
-        assert controller.wait(PATIENCE_S) is not None
-
-
-def test_a_frame_wakes_a_reader_of_several_links() -> None:
-    bus, changed = virtual(), Condition()
-    link = CanLink(bus, PAPER, "controller", changed)
-    try:
-        with Stranger(bus) as stranger:
-            stranger.say(MEASUREMENT_ID + 1, bytes(7))
-            with changed:
-                assert changed.wait_for(lambda: link.pending, PATIENCE_S)
-    finally:
-        link.close()
 
 
 @pytest.mark.parametrize(("wire", "fd", "measurement", "command"), LENGTHS)

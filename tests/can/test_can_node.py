@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from threading import Event
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.can_node import CanNetwork
-from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.spec import LoopSettings
-from tests.support.can_in_process import Flaws, Stranger, virtual
+from tests.support.can_in_process import Flaws, virtual
 from tests.support.can_stage import Bus
-from tests.support.plant_end import COUNTERS, OFF, WIRE, claim_of, command, volts
+from tests.support.plant_end import COUNTERS, OFF, command, volts
 
 SLACK_S = 0.3
 """For a test that other work on the machine keeps waiting: it must run to notice anything."""
@@ -62,18 +56,6 @@ def test_a_command_drives_it_none_from_before_the_session_and_the_heartbeat_repo
     bus.turn()
     assert bus.plant.voltages == volts(5)
     bus.await_heartbeat(PlantState.DRIVEN)
-
-
-def test_heartbeats_come_ten_times_a_second_and_at_once_on_a_change(bus: Bus) -> None:
-    bus.await_heartbeat(PlantState.IDLE)
-    bus.stranger.everything()
-    bus.turn_for(1.0)
-    beats = [m for m in bus.stranger.everything() if m.arbitration_id == PLANT_HEARTBEAT_ID + 1]
-    assert 5 <= len(beats) <= 11  # fewer only where this test is kept waiting
-    bus.until("a heartbeat", lambda: bool(bus.stranger.everything()))
-    bus.endpoint.stop()  # not 0.1 s later, but with this turn
-    bus.turn()
-    assert bus.stranger.heartbeat(PlantState.TRIPPED).cause is TripCause.OPERATOR
 
 
 def test_another_fingerprint_is_never_followed_and_ends_a_session_that_runs(
@@ -121,19 +103,6 @@ def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
     assert 0.5 <= time.monotonic() - bus.said_at < 0.5 + SLACK_S
     assert bus.plant.voltages == OFF
     assert bus.endpoint.trip is TripCause.HOLDER_GONE
-
-
-def test_commands_are_a_sign_of_life_too(hasty_bus: Bus) -> None:
-    """Every frame counts as a sign of life; heartbeats are for when no other frame is sent."""
-    bus = hasty_bus
-    bus.begin()
-    bus.drive()
-    bus.say = None
-    deadline = time.monotonic() + 0.7
-    while time.monotonic() < deadline:
-        bus.side.send(command(0))
-        bus.turn()
-    assert bus.endpoint.state is PlantState.DRIVEN
 
 
 def test_another_number_is_another_session(bus: Bus) -> None:
@@ -221,21 +190,3 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     bus.begin(number=2)
     bus.await_heartbeat(PlantState.GRANTED)
     bus.drive()
-
-
-def test_an_emulated_node_logs_when_its_faults_begin_and_end_and_the_bus_carries_none(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    bus, loop = virtual(), LoopSettings()
-    node = Emulator(loop, WIRE, PlantSettings(faults=["rate:bias=0.1@0.01..0.02"], watchdog_s=10), Event())
-    front = CanNetwork(bus, loop, node.endpoint)
-    with Stranger(bus) as stranger:
-        node.endpoint.claim(claim_of())
-        for k in range(20):
-            front.after_tick(node.tick(None, k), None, 0)
-        front.leave()
-        assert {message.arbitration_id for message in stranger.everything()} == {PLANT_HEARTBEAT_ID + bus.node}
-    said = [record.getMessage() for record in caplog.records if "fault" in record.getMessage()]
-    assert len(said) == 2
-    assert "fault begins (configured): rate:bias=0.1@0.01..0.02" in said[0]
-    assert "fault ends (configured): rate:bias=0.1@0.01..0.02, 5 samples shifted" in said[1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -13,10 +12,8 @@ from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
-from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.testing.hil import Hil
-from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
+from tests.support.can_closed_loop import lockstep_settings, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
 from tests.support.can_stage import measurement
 from tests.support.plant_end import PERIOD_NS, RecordingPlant
@@ -32,15 +29,21 @@ POLICIES: list[tuple[Policy, Policy]] = [
 BOTH = wire_of("on_change", "on_change")
 
 
-@pytest.mark.parametrize(("measurement", "command"), POLICIES)
+@pytest.mark.parametrize(
+    ("wire", "fd"),
+    [
+        (WireSpec(), False),
+        (WireSpec().with_bits(12, 16), True),
+        *((wire_of(*policies), False) for policies in POLICIES),
+    ],
+    ids=["classic", "FD", *map("-".join, POLICIES)],
+)
 def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
-    measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
+    wire: WireSpec, fd: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
-    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
-    settings = settings.model_copy(update={"wire": wire_of(measurement, command)})
-    direct = run_experiment(settings, 0.5)
-    on_bus = run_on_bus(virtual(), settings, 0.5)
+    settings = lockstep_settings(wire)
+    on_bus, direct = run_on_bus(virtual(fd=fd), settings, 0.5), run_experiment(settings, 0.5)
     assert on_bus.model_dump(exclude={"reasons"}) == direct.model_dump(exclude={"reasons"})
 
 
@@ -92,24 +95,3 @@ def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[Ca
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
     silence = [UNCHANGED, UNCHANGED] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
-
-
-# On real processes
-
-
-def test_in_real_time_a_loop_over_a_bus_goes_on_with_fewer_frames(tmp_path: Path) -> None:
-    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
-    with Hil(tmp_path, plant="can-node") as hil:
-        hil.start(settings={**patient, "wire.transmit": "on_change"})
-        hil.run(1.5)
-        log = hil.log
-    figures = log.figures
-    ticks_per_s = 500
-    assert figures.trips == []
-    assert figures.duration_s > 1
-    for stream in (figures.measurement, figures.command):
-        assert stream.frames_per_s is not None
-        assert ticks_per_s / 15 * 0.9 < stream.frames_per_s < 0.85 * ticks_per_s
-    assert figures.final_error_deg is not None
-    assert figures.final_error_deg < 10
-    assert all(frame for name in ("measurement", "command") for _, frame in log.messages(name))

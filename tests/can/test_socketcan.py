@@ -9,17 +9,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import can
 import pytest
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
-from tests.support.can_closed_loop import run_on_bus
-from tests.support.can_in_process import virtual
+from tests.support.can_closed_loop import PATIENCE_S, lockstep_settings, run_on_bus
 from tests.support.kernel import NoSocketCan, run_with_socketcan, vcan_is_up
 from tests.support.zenoh_network import eventually
 
@@ -28,14 +25,13 @@ ROOT = Path(__file__).parent.parent.parent
 TIMEOUT_S = 120.0
 """For what takes 10 s inside: a shared machine can keep a process waiting, and this one is slow to begin with."""
 
-PATIENCE_S = 20.0
-
 LEAN = ("-p", "no:cacheprovider", "--disable-plugin-autoload", "-o", "addopts=--import-mode=importlib")
 """Leaves nothing in this folder, and loads no plugin: importing them takes seconds inside."""
 
 
 def test_frames_cross_on_a_real_socketcan() -> None:
-    pytest_inside = [sys.executable, "-m", "pytest", "tests/can/test_socketcan.py", "-k", "socketcan_inside", *LEAN]
+    chosen = ("-m", "realtime or not realtime", "-k", "socketcan_inside")
+    pytest_inside = [sys.executable, "-m", "pytest", "tests/can/test_socketcan.py", *chosen, *LEAN]
     try:
         done = run_with_socketcan(pytest_inside, ROOT, TIMEOUT_S)
     except NoSocketCan as reason:
@@ -49,41 +45,10 @@ WIRES = {False: WireSpec(), True: WireSpec().with_bits(12, 16)}
 """For classic CAN, of 7 and 2 bytes; for CAN FD, of 10, which travel as 12, and 5."""
 
 
-def assert_the_loop_is_the_experiment(
-    bus: CanSettings, wire: WireSpec, duration_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Figures to the last bit. Nothing here depends on real time: a slow machine is no silent peer."""
-    monkeypatch.setattr(CanLink, "silent", False)
-    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
-    settings = settings.model_copy(update={"wire": wire})
-    assert run_on_bus(bus, settings, duration_s).model_dump(exclude={"reasons"}) == run_experiment(
-        settings, duration_s
-    ).model_dump(exclude={"reasons"})
-
-
-@pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
-def test_the_loop_over_a_bus_without_a_kernel_is_the_experiment(fd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is compared on `vcan0` below, on a bus that is only a queue."""
-    assert_the_loop_is_the_experiment(virtual(fd=fd), WIRES[fd], 0.5, monkeypatch)
-
-
 class TestInside:
     """Where `vcan0` is up."""
 
     __test__ = vcan_is_up()
-
-    @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
-    def test_socketcan_inside_a_frame_crosses_between_two_sockets(self, fd: bool) -> None:
-        data = bytes(range(64 if fd else 8))
-        sent = can.Message(arbitration_id=0x123, is_extended_id=False, is_fd=fd, bitrate_switch=fd, data=data)
-        with (
-            can.Bus(interface="socketcan", channel="vcan0", fd=True) as here,
-            can.Bus(interface="socketcan", channel="vcan0", fd=True) as there,
-        ):
-            here.send(sent)
-            received = there.recv(PATIENCE_S)
-        assert received is not None
-        assert received.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False), received
 
     @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
     def test_socketcan_inside_a_link_carries_frames_and_heartbeats(self, fd: bool) -> None:
@@ -112,5 +77,8 @@ class TestInside:
 
     @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
     def test_socketcan_inside_the_loop_is_the_experiment(self, fd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-        bus = CanSettings(interface="socketcan", channel="vcan0", fd=fd)
-        assert_the_loop_is_the_experiment(bus, WIRES[fd], 0.5, monkeypatch)
+        monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
+        settings = lockstep_settings(WIRES[fd])
+        on_bus = run_on_bus(CanSettings(interface="socketcan", channel="vcan0", fd=fd), settings, 0.5)
+        alone = run_experiment(settings, 0.5)
+        assert on_bus.model_dump(exclude={"reasons"}) == alone.model_dump(exclude={"reasons"})

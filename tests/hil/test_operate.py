@@ -56,7 +56,7 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
     assert " would do" in refused(hil, "goto", "0", "0", "170", "--in", "0.5")  # the first may still have to brake
     assert "rolls" in refused(hil, "goto", "5", "0", "0", "--in", "3")
-    assert "at most 20" in refused(hil, "set-gains", "--C1", "1", "1", "100")
+    assert "law.C1[2]: should be less than or equal to 20" in refused(hil, "set-gains", "--C1", "1", "1", "100")
     hil.run(2.0)
     log = hil.log
     last = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)][-1]

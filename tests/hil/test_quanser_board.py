@@ -8,19 +8,16 @@ from pathlib import Path
 import pytest
 
 from aeroloop.service.testing.conformance.test_plant_end import *  # noqa: F403  # the suite
-from aeroloop.service.testing.fork_server import fork_server
 
 SDK = Path(__file__).parents[1] / "support" / "quanser_sdk"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def fake_package() -> Iterator[None]:
-    """Let processes find the fake where Quanser's package would be: their server imports from PYTHONPATH, too."""
+    """Let processes find the fake where Quanser's package would be: they import from where this process does."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(SDK))
-        fork_server().close()
+        patch.syspath_prepend(SDK)
         yield
-        fork_server().close()
 
 
 @pytest.fixture

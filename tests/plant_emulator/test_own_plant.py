@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from math import isnan
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
@@ -29,11 +26,6 @@ def settings_of(kind: str, **own: Any) -> PlantSettings:
 def table(**own: Any) -> tuple[OwnPlant, Turntable]:
     inner = Turntable(TurntableSettings(**own), PERIOD)
     return OwnPlant(inner, 24.0), inner
-
-
-@pytest.mark.parametrize("kind", ["aero", "rigid_body"])
-def test_our_bodies_are_no_plants_of_ones_own(kind: str) -> None:
-    assert isinstance(PlantSettings(kind=kind, ideal=True).make(PERIOD), EmulatedPlant)
 
 
 def test_a_class_is_made_with_its_own_settings_and_the_period() -> None:
@@ -100,12 +92,6 @@ def test_what_is_no_measurement_is_one_line(gives: str, line: str) -> None:
     assert line in str(caught.value)
 
 
-def test_nan_is_a_failed_sensor_and_no_error() -> None:
-    plant, _ = table(gives="nan", fails_after=0)
-    plant.advance()
-    assert all(map(isnan, plant.measure().attitude))
-
-
 @given(volts=st.floats(allow_nan=False), limit=st.floats(min_value=0.1, max_value=100))
 def test_no_voltage_beyond_the_supplys_limit_reaches_it(volts: float, limit: float) -> None:
     inner = Turntable(TurntableSettings(), PERIOD)
@@ -140,13 +126,3 @@ def test_the_environment_gives_its_settings(monkeypatch: pytest.MonkeyPatch) -> 
     settings = load()
     assert settings.plant.own == {"inertia": 0.25, "parts": {"legs": 3}}
     assert settings.can.options == {"bitrate": 500_000}
-
-
-def test_what_needs_equations_refuses_it() -> None:
-    with pytest.raises(PlantError, match=r"plant.kind = 'aero' or 'rigid_body', and it is 'x:Y'"):
-        settings_of("x:Y").build(PERIOD)
-
-
-def test_a_wrong_kind_is_no_kind() -> None:
-    with pytest.raises(ValidationError):
-        PlantSettings(kind="")

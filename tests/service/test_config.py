@@ -64,12 +64,10 @@ def test_a_refusal_is_one_line_that_names_the_key_whatever_is_set(key: str, valu
         assert (sections[0] if sections else name) in line
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_every_key_is_described_and_a_quantity_has_a_unit(key: str) -> None:
-    description = KEYS[key].description
-    assert description
-    if "float" in str(KEYS[key].annotation):
-        assert "[" in description, description
+def test_every_key_is_described_and_a_quantity_has_a_unit() -> None:
+    assert [key for key, field in KEYS.items() if not field.description] == []
+    quantities = {key: field.description or "" for key, field in KEYS.items() if "float" in str(field.annotation)}
+    assert [key for key, description in quantities.items() if "[" not in description] == []
 
 
 @pytest.mark.parametrize(
@@ -106,17 +104,33 @@ def test_a_wrong_setting_is_named_with_what_it_must_be(override: str, line: str)
     assert str(caught.value) == line
 
 
-@pytest.mark.parametrize("key", LEAVES)
-def test_every_key_can_be_set_in_the_environment(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_key_can_be_set_in_the_environment() -> None:
     """None is refused as unknown; what it must be is not the matter here."""
-    section, _, name = key.partition(".")
-    if kind := kind_with(section, name):
-        monkeypatch.setenv(f"AEROLOOP_{section.upper()}__KIND", kind)
-    monkeypatch.setenv(ENV_PREFIX + key.upper().replace(".", "__"), "[[[{a = 1}]]]")
-    with pytest.raises(ConfigError, match=key.split(".")[-1]) as caught:
-        load()
-    assert "unknown" not in str(caught.value)
-    assert "environment" not in str(caught.value)
+    for key in LEAVES:
+        section, _, name = key.partition(".")
+        with pytest.MonkeyPatch.context() as patch:
+            if kind := kind_with(section, name):
+                patch.setenv(f"AEROLOOP_{section.upper()}__KIND", kind)
+            patch.setenv(ENV_PREFIX + key.upper().replace(".", "__"), "[[[{a = 1}]]]")
+            with pytest.raises(ConfigError, match=key.split(".")[-1]) as caught:
+                load()
+        assert "unknown" not in str(caught.value)
+        assert "environment" not in str(caught.value)
+
+
+def test_file_environment_and_set_replace_each_other_in_this_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("vehicle = 'file'\n[loop]\nrate_hz = 100.0\n")
+    assert load(path).vehicle == "file"
+    monkeypatch.setenv("AEROLOOP_VEHICLE", "environment")
+    monkeypatch.setenv("AEROLOOP_LOOP__LOCKSTEP", "true")
+    monkeypatch.setenv("AEROLOOP_CAN__OPTIONS__BITRATE", "7")
+    loaded = load(path)
+    assert (loaded.vehicle, loaded.loop.rate_hz, loaded.loop.lockstep) == ("environment", 100.0, True)
+    assert loaded.can.options == {"bitrate": 7}
+    assert load(path, ["vehicle=option"]).vehicle == "option"
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.theorem.configured import with_theorem
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -172,6 +172,11 @@ def _worst_attitude(signal: SignalSpec) -> float:
     return sqrt(delta**2 + (2 * delta + delta**2))
 
 
+def paper_s(settings: Settings) -> AdaptiveSettings:
+    assert isinstance(settings.law, AdaptiveSettings)
+    return settings.law
+
+
 @dataclass(frozen=True)
 class _Slopes:
     """How much the moment M = B u of (C.37) changes, at most, with a change of each thing in it [N·m per unit].
@@ -190,7 +195,7 @@ class _Slopes:
     @classmethod
     def of(cls, run: Run) -> _Slopes:
         """For the rates that the run came to."""
-        p = with_theorem(run.settings).law
+        p = paper_s(run.settings)
         C1, C2, J = max(p.C1), max(p.C2), max(p.inertia)
         weight = p.mass * p.gravity * float(np.linalg.norm(p.centre_of_mass))
         W = _largest(run.omega_d)
@@ -232,7 +237,7 @@ def _explained_error(run: Run) -> Array:
     The moment d is what the law would have commanded otherwise, had it known q, ω and θ, with what the quantizer of u
     takes away and what changes while u is held.
     """
-    p, wire = with_theorem(run.settings).law, run.settings.wire
+    p, wire = paper_s(run.settings), run.settings.wire
     slopes, period = _Slopes.of(run), run.settings.loop.period
     d = (
         slopes.q * np.linalg.norm(run.q_seen - run.q, axis=1)
@@ -324,7 +329,7 @@ def test_no_voltage_jumps_by_more_than_a_level_of_each_input_and_smooth_motion_e
 def test_every_voltage_is_the_laws_for_the_attitude_that_never_jumped(bits: str) -> None:
     """The twin decodes the frame, and takes the sign of q from the truth."""
     run = _through_full_turns(bits)
-    wire, body = run.settings.wire, body_of(with_theorem(run.settings).law)
+    wire, body = run.settings.wire, body_of(paper_s(run.settings))
     attitude, rate = wire.attitude.quantizer().level, wire.rate.quantizer().level
     crossed = np.flatnonzero(np.diff(np.sign(run.q[:, 0])))
     near = {int(k) for at in crossed for k in range(at - 20, at + 20)}

@@ -15,12 +15,19 @@ from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
-from aeroloop.service.config import Settings
+from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.figures import Figures, figures
 
 PATIENCE_S = 20.0
+
+
+def lockstep_settings(wire: WireSpec) -> Settings:
+    """The default configuration in lockstep, with a wire."""
+    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
+    return settings.model_copy(update={"wire": wire})
 
 
 def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figures:

@@ -7,7 +7,8 @@ from math import cos, isnan, sin
 
 from aeroloop.plant_emulator.faults.injection import FaultyPlant
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.plant import Measurement
+from tests.support.plant_end import RecordingPlant
 
 PERIOD = 0.1
 LIMIT = 24.0
@@ -18,27 +19,11 @@ def sample(k: int) -> Measurement:
     return Measurement((cos(0.01 * k), 0.0, 0.0, sin(0.01 * k)), (1.0 * k, 10.0 * k, 100.0 * k))
 
 
-class Stand(Plant):
-    """Remembers the voltages of each period."""
-
-    def __init__(self, actuators: int = 2) -> None:
-        self.actuators = actuators
-        self.k = 0
-        self.voltages: tuple[float, ...] = (0.0,) * actuators
-        self.periods: list[tuple[float, ...]] = []
-
-    def actuate(self, voltages: Sequence[float]) -> None:
-        self.voltages = tuple(voltages)
-
-    def advance(self) -> None:
-        self.k += 1
-        self.periods.append(self.voltages)
+class Stand(RecordingPlant):
+    """Measures the count of its periods."""
 
     def measure(self) -> Measurement:
-        return sample(self.k)
-
-    def close(self) -> None:
-        self.voltages = (0.0,) * self.actuators
+        return sample(len(self.periods))
 
 
 def faulty(

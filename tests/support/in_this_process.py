@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from aeroloop.service.lab import workers
-from aeroloop.service.lab.workers import Workers
+from aeroloop.service.lab import burden, laws, sweep, tables
+from aeroloop.service.lab.sweep import Workers
 
 
 class InThisProcess(Executor):
@@ -26,16 +26,18 @@ class InThisProcess(Executor):
         return future
 
 
-def workers_here(count: int = 1, batch_s: float = 0.0) -> Workers[Any]:
+def workers_here(count: int = 1, most: int = 1) -> Workers:
     """Workers in this process; with a count above one their results come in no order."""
-    return Workers(InThisProcess(), count, batch_s)
+    return Workers(InThisProcess(), count, most)
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every engine run in this process."""
+    """Let every study run in this process."""
 
     @contextmanager
-    def executor(_engine: str) -> Iterator[tuple[Executor, int]]:
-        yield InThisProcess(), 1
+    def here(engine: str = sweep.PROCESSES) -> Iterator[Workers]:
+        sweep.check_engine(engine)
+        yield workers_here()
 
-    monkeypatch.setattr(workers, "executor_of", executor)
+    for module in (sweep, tables, burden, laws):
+        monkeypatch.setattr(module, "open_workers", here)

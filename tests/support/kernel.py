@@ -1,20 +1,14 @@
 """SocketCAN kernel for a test's command, also on a machine whose kernel has none.
 
-`run_with_socketcan` runs a command where `vcan0` is up and carries CAN FD. It takes the first of these that works:
-
-1. a network namespace with a fresh `vcan0`, if this kernel has vcan and allows it: as root, or as any user where user
-   namespaces are allowed;
-2. an existing `vcan0`, up and with the MTU of CAN FD;
-3. user-mode Linux: a kernel that is an ordinary program, from the distribution's package `user-mode-linux`, which is
-   downloaded and unpacked into a cache the first time, not installed. It needs neither root nor hardware.
+`run_with_socketcan` runs a command where `vcan0` is up and carries CAN FD: here, if it is; else in user-mode Linux, a
+kernel that is an ordinary program, from the distribution's package `user-mode-linux`, which is downloaded and unpacked
+into a cache the first time, not installed. It needs neither root nor hardware.
 
 User-mode Linux boots on this machine's files, so the same interpreter and packages run inside. This file is its init:
-the part under "Inside" runs there as process 1 and must import only the standard library. Inside, in ways 1 and 3:
-
-- There is no network but `lo` and `vcan0`.
-- User-mode Linux has one CPU, 512 MB, and root's rights over the user's files outside; files are read-only except for
-  the command's working directory and TMPDIR, which starts empty and is deleted afterwards. A process is several times
-  slower than outside, so only tests without real time run there.
+the part under "Inside" runs there as process 1 and must import only the standard library. Inside there is no network
+but `lo` and `vcan0`, one CPU, 512 MB, and root's rights over the user's files outside; files are read-only except for
+the command's working directory and TMPDIR, which starts empty and is deleted afterwards. A process is several times
+slower than outside, so only tests without real time run there.
 """
 
 from __future__ import annotations
@@ -33,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +40,7 @@ MODULES = ("can-dev", "vcan", "can", "can-raw")
 """What SocketCAN needs, in the order in which they need each other."""
 
 MEMORY_MIB = 512
+SHM = "/dev/shm"  # noqa: S108 - the kernel checks what it finds there
 FETCH_S = 300.0
 """For 40 MB of package, after 10 MB of package lists where there are none."""
 BOOT_S = 60.0
@@ -69,14 +64,7 @@ def run_with_socketcan(command: Sequence[str], cwd: Path, timeout_s: float) -> s
         subprocess.TimeoutExpired: It took too long, and was killed.
         RuntimeError: Its kernel ended before it did.
     """
-    in_namespace = (sys.executable, "-I", "-S", __file__, "namespace")
-    if _run([*in_namespace, sys.executable, "-I", "-S", "-c", ""], cwd, BOOT_S).returncode == 0:
-        done = _run([*in_namespace, *command], cwd, timeout_s)
-    elif vcan_is_up():
-        done = _run(command, cwd, timeout_s)
-    else:
-        return _run_in_uml(command, cwd, timeout_s)
-    return subprocess.CompletedProcess(command, done.returncode, done.stdout, done.stderr)
+    return _run(command, cwd, timeout_s) if vcan_is_up() else _run_in_uml(command, cwd, timeout_s)
 
 
 def vcan_is_up() -> bool:
@@ -147,18 +135,19 @@ def _run_in_uml(command: Sequence[str], cwd: Path, timeout_s: float) -> subproce
             )
         )
         kernel = [
+            *("taskset", "-c", "0"),  # between two processors each of its system calls takes three times as long
             str(package / "usr/bin/linux.uml"),
             f"mem={MEMORY_MIB}M",
             f"uml_dir={exchange}/uml",
             *("root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", "devtmpfs.mount=0"),
             *("con=null", "con0=null,fd:1", "ssl=null"),
             f'init="{exchange}/python"',
-            *("--", "-I", "-S", f'"{Path(__file__).resolve()}"', "uml", f'"{exchange}"'),
+            *("--", "-I", "-S", f'"{Path(__file__).resolve()}"', f'"{exchange}"'),
         ]
-        env = {"PATH": os.defpath, "HOME": name, "TMPDIR": str(_memory_folder())}
+        roomy = shutil.disk_usage(SHM).free >= MEMORY_MIB * 2**20  # for the file that is the inner machine's memory
+        env = {"PATH": os.defpath, "HOME": name, "TMPDIR": SHM if roomy else tempfile.gettempdir()}
         try:
-            with _on_one_cpu():
-                done = _run(kernel, exchange, BOOT_S + timeout_s, env)
+            done = _run(kernel, exchange, BOOT_S + timeout_s, env)
             console = done.stderr + done.stdout
         except subprocess.TimeoutExpired as error:
             if not (exchange / "started").exists():
@@ -175,32 +164,6 @@ def _run_in_uml(command: Sequence[str], cwd: Path, timeout_s: float) -> subproce
     return subprocess.CompletedProcess(command, result["returncode"], result["stdout"], result["stderr"])
 
 
-@contextlib.contextmanager
-def _on_one_cpu() -> Iterator[None]:
-    """Keep this thread, and what it starts, on one processor.
-
-    User-mode Linux and the processes in it take turns at every system call and page fault; between two processors that
-    takes three times as long.
-    """
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {sorted(allowed)[os.getpid() % len(allowed)]})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, allowed)
-
-
-def _memory_folder() -> Path:
-    """Where the file goes that is the inner machine's memory: /dev/shm if that is big enough and may hold code."""
-    shm = Path("/dev/shm")  # noqa: S108 - the kernel checks what it finds there
-    with contextlib.suppress(OSError):
-        space = os.statvfs(shm)
-        roomy = space.f_bavail * space.f_frsize >= MEMORY_MIB * 2**20
-        if roomy and not space.f_flag & os.ST_NOEXEC and os.access(shm, os.W_OK):
-            return shm
-    return Path(tempfile.gettempdir())
-
-
 def _user_mode_linux() -> Path:
     """The unpacked package, from the cache or else from where this machine gets its packages.
 
@@ -213,41 +176,27 @@ def _user_mode_linux() -> Path:
         return unpacked
     apt, dpkg = shutil.which("apt-get"), shutil.which("dpkg-deb")
     if apt is None or dpkg is None or platform.machine() != "x86_64":
-        raise NoSocketCan(f"this kernel has no vcan for us, and {PACKAGE} comes for Debian and Ubuntu on x86_64 only")
+        raise NoSocketCan(f"this kernel has no vcan0, and {PACKAGE} comes for Debian and Ubuntu on x86_64 only")
     cache.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache) as name:
         work = Path(name)
         for folder in ("lists/partial", "cache/archives/partial"):
             (work / folder).mkdir(parents=True)
-        get = (apt, "-q", "-o", "APT::Sandbox::User=root", "-o", "Acquire::http::Timeout=30")
-        own = (*get, "-o", f"Dir::State::Lists={work}/lists", "-o", f"Dir::Cache={work}/cache")
-        steps = (
-            (*get, "download", PACKAGE),
-            (*own, "update"),  # this machine's lists are missing or old, and may not be ours to change
-            (*own, "download", PACKAGE),
-        )
-        complaints = []
+        # This machine's lists may be missing or old, and not ours to change.
+        options = ("APT::Sandbox::User=root", f"Dir::State::Lists={work}/lists", f"Dir::Cache={work}/cache")
+        own = (apt, "-q", *(word for option in (*options, "Acquire::http::Timeout=30") for word in ("-o", option)))
         try:
-            for step in steps:
-                complaints.append(_run(step, work, FETCH_S).stderr)
-                if any(work.glob("*.deb")):
-                    break
-            else:
-                why = " / ".join(dict.fromkeys(said.strip().splitlines()[0] for said in complaints[1:] if said.strip()))
-                raise NoSocketCan(f"this kernel has no vcan for us, and apt-get got no {PACKAGE}: {why}")
-            (package,) = work.glob("*.deb")
-            done = _run((dpkg, "-x", str(package), str(work / "root")), work, FETCH_S)
+            for step in ((*own, "update"), (*own, "download", PACKAGE)):
+                done = _run(step, work, FETCH_S)
+            packages = [*work.glob("*.deb")]
+            if packages:
+                done = _run((dpkg, "-x", str(packages[0]), str(work / "root")), work, FETCH_S)
         except subprocess.TimeoutExpired:
-            raise NoSocketCan(f"this kernel has no vcan for us, and getting {PACKAGE} took too long") from None
+            raise NoSocketCan(f"this kernel has no vcan0, and getting {PACKAGE} took too long") from None
         if done.returncode:
-            raise NoSocketCan(
-                f"this kernel has no vcan for us, and {PACKAGE} did not unpack: {_last_line(done.stderr)}"
-            )
-        try:
+            raise NoSocketCan(f"this kernel has no vcan0, and {PACKAGE} cannot be had: {_last_line(done.stderr)}")
+        with contextlib.suppress(OSError):  # another process was faster
             (work / "root").rename(unpacked)
-        except OSError:
-            if not unpacked.exists():  # else somebody was faster
-                raise
     return unpacked
 
 
@@ -303,22 +252,6 @@ def _set_links_up() -> None:
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
 
 
-def _become_in_namespace(command: Sequence[str]) -> None:
-    """Become a command, in a network namespace of its own with `vcan0`."""
-    clone_newuser, clone_newnet = 0x10000000, 0x40000000
-    user, group = os.getuid(), os.getgid()
-    if user == 0:
-        _libc("unshare", clone_newnet)
-    else:
-        _libc("unshare", clone_newuser | clone_newnet)
-        itself = Path("/proc/self")
-        (itself / "setgroups").write_text("deny")
-        (itself / "uid_map").write_text(f"{user} {user} 1")
-        (itself / "gid_map").write_text(f"{group} {group} 1")
-    _set_links_up()
-    os.execvp(command[0], list(command))  # noqa: S606 - our own command
-
-
 def _be_init(exchange: Path) -> None:
     """Be process 1 of user-mode Linux: make ready, run the command, report its outcome, halt."""
     result: dict[str, Any] = {}
@@ -363,7 +296,5 @@ def _mount(kind: str, at: str, what: str = "") -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "namespace":
-        _become_in_namespace(sys.argv[2:])
-    elif sys.argv[1] == "uml" and os.getpid() == 1:
-        _be_init(Path(sys.argv[2]))
+    if os.getpid() == 1:
+        _be_init(Path(sys.argv[1]))

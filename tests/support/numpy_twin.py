@@ -56,6 +56,7 @@ class Body:
     C2: Array
     Gamma: Array
     bound: float
+    centre: Array
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,8 @@ def projected(p: Body, theta: Array, tau: Array) -> Array:
 
     P = ‖θ̂‖² − k_θ², and c grows from 0 at P = 0 to 1 at ‖θ̂‖ = k_θ/0.95.
     """
-    P, slope = theta @ theta - p.bound**2, 2 * theta
+    moved = theta - p.centre
+    P, slope = moved @ moved - p.bound**2, 2 * moved
     if P <= 0 or slope @ tau <= 0:
         return tau
     c = min(1.0, float(P) / ((p.bound / 0.95) ** 2 - p.bound**2))

@@ -24,6 +24,7 @@ from aeroloop.protocol.runtime import node
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.daemon.operator_changes import SETPOINTS, OperatorChanges
@@ -122,8 +123,6 @@ class Loop:
         self,
         reference: Reference,
         settings: ControllerSettings = CONFIGURED,
-        *,
-        rolls: bool = False,
     ) -> None:
         self.clock = FakeClock()
         with pytest.MonkeyPatch.context() as patch:
@@ -132,15 +131,8 @@ class Loop:
             self.role = LonelyNode("controller", "aero", NetworkSettings(), {}, name="controller-7", clock=self.clock)
         self.configured = reference
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
-        self.live = OperatorChanges(
-            self.role,
-            LAW,
-            reference,
-            settings,
-            self.trace,
-            rolls=rolls,
-            why_none=lambda: "controller-7 does not have aero",
-        )
+        configured = Settings(law=LAW, reference=reference, controller=settings, wire=WIRE)
+        self.live = OperatorChanges(self.role, configured, self.trace, lambda: "controller-7 does not have aero")
         self.live.serve()
         self.controller = self.fresh()
         self.k, self.session = 0, ""

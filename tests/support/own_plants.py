@@ -10,7 +10,6 @@ from pydantic import BaseModel, Field
 
 from aeroloop import Measurement, Plant
 from aeroloop.plant_emulator.plant import State
-from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.wire.attitude import Vector
 
 
@@ -112,29 +111,3 @@ class Unfinished(Plant):
 
 class NoPlant:
     """Is no plant."""
-
-
-class OwnAero(Plant):
-    """The Aero of our own, through the door of every other plant."""
-
-    actuators = 2
-    repeatable = True
-
-    def __init__(self, settings: BaseModel, period: float) -> None:
-        super().__init__(settings, period)
-        self._aero = PlantSettings().build(period)
-
-    def actuate(self, voltages: Sequence[float]) -> None:
-        self._aero.actuate(voltages)
-
-    def advance(self) -> None:
-        self._aero.advance()
-
-    def measure(self) -> Measurement:
-        return self._aero.measure()
-
-    def truth(self) -> State | None:
-        return self._aero.truth()
-
-    def close(self) -> None:
-        self._aero.close()

@@ -59,7 +59,7 @@ class RecordingPlant(Plant):
 
     def __init__(self, actuators: int = 2) -> None:
         self.actuators = actuators
-        self.held: list[tuple[float, ...]] = []
+        self.periods: list[tuple[float, ...]] = []
         self.now = REST
         self.voltages: tuple[float, ...] = (0.0,) * actuators
 
@@ -67,7 +67,7 @@ class RecordingPlant(Plant):
         self.voltages = tuple(voltages)
 
     def advance(self) -> None:
-        self.held.append(self.voltages)
+        self.periods.append(self.voltages)
 
     def measure(self) -> Measurement:
         return self.now

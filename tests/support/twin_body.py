@@ -20,4 +20,5 @@ def body_of(p: AdaptiveSettings) -> Body:
         C2=np.diag(p.C2),
         Gamma=np.diag(p.Gamma),
         bound=p.damping_bound,
+        centre=np.array(p.damping_estimate),
     )

@@ -25,18 +25,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal
 
 import casadi as ca
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import (
-    MAX_GAIN,
     EstimateSettings,
     ExpressionLaw,
+    MatrixGain,
     Now,
-    Vector,
     check_allocation,
     gravity_torque,
     voltages_for,
@@ -44,16 +43,6 @@ from aeroloop.service.control.laws.interface import (
 
 ESTIMATE_REACH: Final = 1 / 0.95
 """‖θ̂‖ may reach this times k_θ: Remark 5's inequality needs every θ of Assumption 2 in the projection's inner ball."""
-
-
-def _gain(gain: Vector) -> Vector:
-    if not (min(gain) > 0 and max(gain) <= MAX_GAIN):
-        raise ValueError(f"every element must be positive and at most {MAX_GAIN:g}")
-    return gain
-
-
-MatrixGain = Annotated[Vector, AfterValidator(_gain)]
-"""The diagonal of a positive definite gain matrix."""
 
 
 class AdaptiveSettings(EstimateSettings):

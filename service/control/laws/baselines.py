@@ -8,7 +8,8 @@
     τ        torque           B u                                           N·m         3
 
 With the feedforward of (C.22), the body (C.2) becomes J ω̇_e = τ, so each law is its feedback τ. The estimate of the
-damping is the paper's first one, and stays. All default gains come from one rule (`tuning`).
+damping is the paper's first one, and stays. All default gains come from one rule, `tuned`: each law gets the bandwidth
+and the damping ratio that the paper's gains give, and knows the same body.
 
     pd       −k_p (±ε̃) − k_d ω_e                              Wen and Kreutz-Delgado 1991; Paden and Panja 1988
     pid      the same − k_i e_I                               Goodarzi, Lee and Lee 2013; Åström and Hägglund 1995
@@ -28,29 +29,104 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Final, Literal, TypeVar
+from math import sqrt
+from typing import ClassVar, Final, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
 from pydantic import Field, NonNegativeFloat
 
 from aeroloop.protocol.wire.attitude import R, S
-from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings
 from aeroloop.service.control.laws.interface import (
     Diagonal,
     EstimateSettings,
     ExpressionLaw,
     Floats,
     Gains3,
+    LawSettings,
+    MatrixGain,
     Now,
     Vector,
     check_allocation,
     gravity_torque,
     voltages_for,
 )
-from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, VOLTAGE_LIMIT, tuned
 
-_PD, _PID, _SLIDING, _LQR = (tuned(kind, PAPER_BODY, PAPER) for kind in ("pd", "pid", "sliding", "lqr"))
+# ── one tuning rule ──
+
+VOLTAGE_LIMIT: Final = 24.0
+"""Largest voltage of the Aero's supply [V]."""
+TUNED: Final = ("pd", "pid", "adaptive-torque", "sliding", "lqr")
+"""Kinds that the tuning rule has settings for. The law without adaptation has the paper's own gains."""
+
+
+class Response(NamedTuple):
+    """Linearised attitude error, an element an axis: bandwidth ωₙ [rad/s] and damping ratio ζ [1]."""
+
+    bandwidth: Vector
+    damping: Vector
+
+
+def response_of(inertia: Vector, C1: Vector, C2: Vector) -> Response:
+    """What the paper's gains give a body with this inertia [kg·m²].
+
+    Near the reference, without quantization and with the model exact, (C.22) gives every axis of φ = 2ε̃ the equation
+
+        J φ̈ + (C₂ + J C₁/2) φ̇ + ½ (1 + C₁C₂) φ = 0,
+
+    from z₂ = ω_e + C₁ε̃ and ᾱ = −½ C₁ω_e to first order, for η̃ near ±1.
+    """
+    axes = list(zip(inertia, C1, C2, strict=True))
+    bandwidth = [sqrt((1 + c1 * c2) / (2 * J)) for J, c1, c2 in axes]
+    damping = [(c2 / J + c1 / 2) / (2 * wn) for (J, c1, c2), wn in zip(axes, bandwidth, strict=True)]
+    return Response(*(_rounded(values, digits=15) for values in (bandwidth, damping)))
+
+
+def tuned(kind: str, body: LawSettings, response: Response) -> dict[str, Vector]:
+    """The settings, by name, that give a law of this kind a response with this body; none for a kind without a rule."""
+    torques = [sum(map(abs, row)) for row in body.allocation]
+    axes = [_tuned_axis(kind, *axis) for axis in zip(body.inertia, torques, *response, strict=True)]
+    return {name: _rounded([axis[name] for axis in axes]) for name in axes[0]}
+
+
+def _tuned_axis(kind: str, J: float, torque_per_volt: float, wn: float, zeta: float) -> dict[str, float]:
+    match kind:
+        case "pd":  # J(s² + 2ζωₙs + ωₙ²) with kp on ε̃ = φ/2
+            return {"kp": 2 * J * wn**2, "kd": 2 * J * zeta * wn}
+        case "pid":  # J(s² + 2ζωₙs + ωₙ²)(s + a) = Js³ + kd s² + (kp/2 + ki)s + ki c/2: a third pole, and c, by ωₙ
+            a, c = 0.1 * wn, wn / 2
+            ki = 2 * J * a * wn**2 / c
+            kp = 2 * J * (wn**2 + 2 * zeta * wn * a) - 2 * ki
+            return {"kp": kp, "kd": J * (2 * zeta * wn + a), "ki": ki, "attitude_share": c, "reset_time": 1 / wn}
+        case "adaptive-torque":  # the PID, which is its special case; friction is learned a tenth as fast; for ζ < 2.1
+            pid = _tuned_axis("pid", J, torque_per_volt, wn, zeta)
+            C1, ki = pid["attitude_share"], pid["ki"]
+            C2 = pid["kd"] - J * C1 / 2
+            Gammas = {"Gamma_torque": ki, "Gamma_damping": 0.1 * ki, "Gamma_coulomb": 0.1 * ki}
+            bounds = {"torque_bound": 0.5 * VOLTAGE_LIMIT * torque_per_volt, "reset_time": pid["reset_time"]}
+            return {"k1": pid["kp"] - C1 * C2, "C1": C1, "C2": C2, **Gammas, **bounds}
+        case "sliding":  # two real poles, −λ/2 and −K/(JΦ), so both at −ωₙ; K is half of the torque that there is
+            K = 0.5 * VOLTAGE_LIMIT * torque_per_volt
+            return {"slope": 2 * wn, "strength": K, "layer": K / (J * wn)}
+        case "lqr":  # weights for which τ = −Jωₙ²φ − 2ζωₙJφ̇ is optimal in continuous time; they exist for ζ ≥ 1/√2
+            rate_weight = max(0.0, (2 * zeta * wn * J) ** 2 - 2 * J**2 * wn**2)
+            return {"attitude_weight": (J * wn**2) ** 2, "rate_weight": rate_weight}
+    return {}
+
+
+def _rounded(values: list[float], digits: int = 5) -> Vector:
+    """So that a reader can copy it."""
+    x, y, z = (float(f"{value:.{digits}g}") for value in values)
+    return x, y, z
+
+
+_BODY: Final = LawSettings(kind="Table C.1")
+_PAPER: Final = response_of(_BODY.inertia, (0.3, 0.3, 0.3), (0.15, 0.15, 0.15))  # 4.9 rad/s and 0.72, of Table C.1
+DEFAULTS: Final = {kind: tuned(kind, _BODY, _PAPER) for kind in TUNED}
+_PD, _PID, _SLIDING, _LQR = (DEFAULTS[kind] for kind in ("pd", "pid", "sliding", "lqr"))
+
+# ── what they have in common ──
 
 
 class TrackingSettings(EstimateSettings):

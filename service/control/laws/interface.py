@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from aeroloop.protocol.wire.attitude import R, S
 
@@ -35,16 +35,10 @@ Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
 Gains3 = tuple[Gain, Gain, Gain]
 """One for each body axis: x, y, z."""
 
-
-def _positive(values: Vector) -> Vector:
-    if min(values) <= 0:
-        raise ValueError("every element must be positive")
-    return values
-
-
-Diagonal = Annotated[Vector, AfterValidator(_positive)]
+Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 """The diagonal of a positive definite matrix."""
-
+MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
+"""The same of a gain."""
 Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
 
 
@@ -180,10 +174,14 @@ class PythonLaw(Law[T]):
 # ── the body of a law's settings ──
 
 
-def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
-    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""
+def gravity_torque(p: LawSettings, q: X) -> X:
+    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,).
+
+    Of an expression it is an expression, of an array an array.
+    """
     weight = ca.vertcat(0, 0, -p.mass * p.gravity)
-    return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
+    torque = S(ca.SX(p.centre_of_mass)) @ R(ca.SX(cast(Any, q))).T @ weight
+    return cast(X, np.asarray(ca.evalf(torque)).ravel() if isinstance(q, np.ndarray) else torque)
 
 
 def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:

@@ -11,6 +11,7 @@ from aeroloop.protocol.messages.operator import Gains
 from aeroloop.protocol.plugins import PluginError, exception_line, find, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
 from aeroloop.service.control.laws.baselines import (
     LQRSettings,
     NonadaptiveSettings,
@@ -27,6 +28,7 @@ BUILT_IN: Final = {
     "nonadaptive": f"{_LAWS}.baselines:Nonadaptive",
     "pd": f"{_LAWS}.baselines:PD",
     "pid": f"{_LAWS}.baselines:PID",
+    "adaptive-torque": f"{_LAWS}.adaptive_torque:AdaptiveTorque",
     "sliding": f"{_LAWS}.baselines:Sliding",
     "lqr": f"{_LAWS}.baselines:LQR",
 }
@@ -49,6 +51,7 @@ MODELS: Final = {
     "nonadaptive": NonadaptiveSettings,
     "pd": PDSettings,
     "pid": PIDSettings,
+    "adaptive-torque": AdaptiveTorqueSettings,
     "sliding": SlidingSettings,
     "lqr": LQRSettings,
     _OWN: OwnLawSettings,
@@ -59,6 +62,7 @@ LawSection = Annotated[
     | Annotated[NonadaptiveSettings, Tag("nonadaptive")]
     | Annotated[PDSettings, Tag("pd")]
     | Annotated[PIDSettings, Tag("pid")]
+    | Annotated[AdaptiveTorqueSettings, Tag("adaptive-torque")]
     | Annotated[SlidingSettings, Tag("sliding")]
     | Annotated[LQRSettings, Tag("lqr")]
     | Annotated[OwnLawSettings, Tag(_OWN)],

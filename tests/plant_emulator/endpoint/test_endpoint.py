@@ -1,25 +1,39 @@
-"""Plant endpoint: refused claims, deadlines in words and in time, codes of measurements.
+"""Plant endpoint: refused claims, deadlines in words and in time, codes of measurements, limits, the session's record.
 
 What commands, claims, releases, stops and trips do is in test_freshness.py. Time is the tick index, so every bound on
-time is exact to the tick; period i is the time from tick i to tick i + 1, and `plant.held[i]` are its voltages.
+time is exact to the tick; period i is the time from tick i to tick i + 1, and `plant.periods[i]` are its voltages.
 """
 
 from __future__ import annotations
 
-from math import inf, isfinite, nan
+from collections.abc import Callable
+from math import cos, inf, isfinite, nan, radians, sin
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Grant, Refusal
-from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Grant, Refusal, SessionRecord
+from aeroloop.protocol.messages.operator import Gains, Hold
+from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from tests.support.plant_end import OFF, PERIOD_NS, WIRE, RecordingPlant, claim_of, claimed, command, state_of
+from tests.support.plant_end import (
+    AT_REST,
+    COUNTERS,
+    OFF,
+    PERIOD_NS,
+    WIRE,
+    RecordingPlant,
+    claim_of,
+    claimed,
+    command,
+    state_of,
+)
 
 # ── claims ──
 
@@ -61,7 +75,7 @@ def test_time_begins_at_tick_0_and_the_very_first_call_takes_no_command(late: in
     frame = endpoint.tick(command(0), late)
     assert frame is not None
     assert WIRE.measurement.counter(frame) == 0
-    assert plant.held == [OFF] * late
+    assert plant.periods == [OFF] * late
     assert endpoint.accepted == 0
 
 
@@ -77,7 +91,7 @@ def test_the_watchdogs_time_can_be_set_and_is_in_the_events_text(watchdog_s: flo
     endpoint.tick(command(0), 1)
     for k in range(2, 300):
         endpoint.tick(None, k)
-    assert plant.held.index(OFF) == ticks
+    assert plant.periods.index(OFF) == ticks
     assert endpoint.notices[-1][:3] == ("tripped", f"no fresh command for {2 * ticks} ms: 0 V", "of-a")
     assert endpoint.notices[-1].tick == ticks
 
@@ -97,18 +111,7 @@ def test_a_granted_claim_waits_so_long_for_its_first_command(counter_bits: int, 
     assert endpoint.tick(None, ticks + 1) is None
     assert state_of(endpoint) is PlantState.TRIPPED
     assert f"no first command within {ticks * 0.002:.3g} s" in endpoint.notices[-1].text
-    assert set(plant.held) == {OFF}
-
-
-def test_a_command_without_a_valid_value_trips_at_once_and_a_lost_holder_by_its_name() -> None:
-    endpoint, plant = claimed()
-    endpoint.tick(command(0), 1)
-    assert endpoint.tick(WIRE.command.pack(1, [5, WIRE.voltage.quantizer().invalid]), 2) is None
-    assert plant.held[-1] == OFF
-    endpoint.claim(claim_of("b"))
-    endpoint.lost("b")
-    texts = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
-    assert texts == ["a commands 'no valid value': 0 V", "b is gone: 0 V"]
+    assert set(plant.periods) == {OFF}
 
 
 # ── measurements ──
@@ -165,3 +168,148 @@ def test_what_a_quantizer_holds_outlasts_a_failed_sensor_but_no_session() -> Non
     assert endpoint.release("of-a")
     assert isinstance(endpoint.claim(claim_of("b", wire=wire)), Grant)
     assert codes_of_x(5, 2.2, 3.0, 3.1) == [2, 2, 3]
+
+
+# ── limits: tilt, rate, time at full voltage, time without valid sensor values ──
+
+
+def turned(degrees: float, axis: str = "y") -> Measurement:
+    half = radians(degrees) / 2
+    return Measurement((cos(half), 0.0, sin(half) * (axis == "y"), sin(half) * (axis == "z")), AT_REST)
+
+
+def driven(limits: LimitSettings) -> tuple[Endpoint, RecordingPlant]:
+    """An endpoint at tick 1, at full voltage."""
+    plant = RecordingPlant()
+    full = WIRE.voltage.quantizer().outermost
+    endpoint = Endpoint(plant, WIRE, PERIOD_NS, limits=LimitMonitor(limits, PERIOD_NS, full))
+    assert isinstance(endpoint.claim(claim_of()), Grant)
+    endpoint.tick(None, 0)
+    endpoint.tick(WIRE.command.pack(0, [31, -31]), 1)
+    assert endpoint.state is PlantState.DRIVEN
+    return endpoint, plant
+
+
+@pytest.mark.parametrize(
+    ("within", "beyond", "why"),
+    [
+        (turned(29.9), turned(30.1), "tilted by 30.1°, more than limits.max_tilt_deg = 30°: 0 V"),
+        (turned(-29.9), turned(-30.1), "tilted by 30.1°, more than limits.max_tilt_deg = 30°: 0 V"),
+        (
+            Measurement(IDENTITY, (0.0, 3.0, 3.9)),
+            Measurement(IDENTITY, (0.0, 3.0, 4.1)),
+            "turns at 5.08 rad/s, more than limits.max_rate = 5 rad/s: 0 V",
+        ),
+    ],
+)
+def test_beyond_an_envelope_it_trips_within_the_tick_and_names_it(
+    within: Measurement, beyond: Measurement, why: str
+) -> None:
+    endpoint, plant = driven(LimitSettings(max_tilt_deg=30.0, max_rate=5.0))
+    plant.now = within
+    assert endpoint.tick(None, 2) is not None
+    plant.now = beyond
+    assert endpoint.tick(None, 3) is None
+    assert (endpoint.state, endpoint.trip, plant.voltages) == (PlantState.TRIPPED, TripCause.ENVELOPE, OFF)
+    assert endpoint.cause == why
+    assert isinstance(endpoint.claim(claim_of("b", auto_arm=False)), Refusal)  # latched, as every trip
+
+
+def test_turning_about_the_vertical_is_no_tilt() -> None:
+    endpoint, plant = driven(LimitSettings(max_tilt_deg=1.0))
+    for k, yaw in enumerate(range(0, 360, 10), start=2):
+        plant.now = turned(yaw, "z")
+        assert endpoint.tick(WIRE.command.pack((k - 1) % COUNTERS, [1, 1]), k) is not None
+
+
+@pytest.mark.parametrize(
+    ("limit", "cause"), [("max_saturated_s", TripCause.SATURATION), ("max_invalid_s", TripCause.SENSORS)]
+)
+def test_what_may_last_a_while_trips_just_after_it(limit: str, cause: TripCause) -> None:
+    """0.02 s are 10 ticks; the eleventh in a row is one too many. One tick of another kind begins the count anew."""
+    endpoint, plant = driven(LimitSettings.model_validate({limit: 0.02}))
+    saturates = cause is TripCause.SATURATION
+    for k in range(1, 60):
+        plant.now = Measurement((1.0 if saturates or k % 8 == 0 else nan, 0.0, 0.0, 0.0), AT_REST)
+        endpoint.tick(WIRE.command.pack(k % COUNTERS, [31 if saturates and k % 8 else 30, 0]), k + 1)
+    assert endpoint.trip is None  # the last tick of another kind was the 56th, of 59
+    ticks = 3
+    while endpoint.state is PlantState.DRIVEN:
+        assert ticks < 20
+        plant.now = Measurement((1.0 if saturates else nan, 0.0, 0.0, 0.0), AT_REST)
+        endpoint.tick(WIRE.command.pack((57 + ticks) % COUNTERS, [31 if saturates else 30, 0]), 58 + ticks)
+        ticks += 1
+    assert ticks == 11
+    assert endpoint.trip == cause
+    assert plant.voltages == OFF
+
+
+# ── record of the last session, for the next controller ──
+
+
+GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
+
+
+def record(name: str, yaw: float = 30.0) -> SessionRecord:
+    """What a controller hands over."""
+    return SessionRecord(
+        controller=name, session=f"of-{name}", gains=GAINS, gains_from="operator",
+        reference=Hold(attitude=(0.0, 0.0, yaw)), reference_from="operator", within_s=2.0, since_tick=0,
+    )  # fmt: skip
+
+
+def last_granted(end: VehicleClaim, name: str) -> SessionRecord | None:
+    """The record that a claim is granted with."""
+    answer = end.claim(claim_of(name))
+    assert isinstance(answer, Grant)
+    return answer.last
+
+
+@pytest.fixture(params=["endpoint", "bridge"])
+def end(request: pytest.FixtureRequest) -> VehicleClaim:
+    """Both ends that grant claims, armed."""
+    if request.param == "endpoint":
+        return Endpoint(RecordingPlant(), WIRE, PERIOD_NS, armed=True)
+    return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
+
+
+def lost_and_stopped(end: VehicleClaim) -> None:
+    """A later stop replaces how it ended."""
+    end.lost("a")
+    end.stop()
+
+
+ENDINGS: list[tuple[Callable[[VehicleClaim], object], TripCause | str]] = [
+    (lambda end: end.release("of-a"), "released"),
+    (lambda end: end.lost("a"), TripCause.HOLDER_GONE),
+    (lambda end: end.expire(TripCause.NO_ANSWER, "no answer"), TripCause.NO_ANSWER),
+    (lambda end: end.stop(), TripCause.OPERATOR),
+    (lost_and_stopped, TripCause.OPERATOR),
+]
+
+
+@pytest.mark.parametrize(("ends", "how"), ENDINGS)
+def test_the_next_controller_gets_the_last_record_and_how_its_session_ended(
+    end: VehicleClaim, ends: Callable[[VehicleClaim], object], how: TripCause | str
+) -> None:
+    assert not end.keep(record("a"))  # no session
+    assert last_granted(end, "a") is None
+    changes = list(end.changes)
+    assert end.keep(record("a"))
+    assert not end.keep(record("b"))  # of another controller, of another session
+    assert not end.keep(record("a").model_copy(update={"session": "of-b"}))
+    assert end.keep(record("a", yaw=50.0))  # the newest counts
+    assert end.changes == changes  # it is no change of the trace
+    ends(end)
+    assert not end.keep(record("a"))
+    end.arm()
+    assert last_granted(end, "b") == record("a", yaw=50.0).model_copy(update={"ended": how})
+    end.release("of-b")
+    assert last_granted(end, "c") is None  # a session without a record leaves none
+
+
+def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: VehicleClaim) -> None:
+    end.stop()
+    end.stop(TripCause.DUPLICATE, "two plants")
+    end.stop()
+    assert (end.trip, [notice.kind for notice in end.notices]) == (TripCause.DUPLICATE, ["tripped", "tripped"])

@@ -71,8 +71,8 @@ def test_no_valid_value_is_said_once_held_and_ended_by_the_next_frame() -> None:
         25: BOTH.measurement.pack(25, no_value),
         30: BOTH.measurement.pack(30, (0,) * 6),
     }
-    assert plant.held[9:12] == [volts(), OFF, OFF]
-    assert plant.held[30:] == [volts()] * 9
+    assert plant.periods[9:12] == [volts(), OFF, OFF]
+    assert plant.periods[30:] == [volts()] * 9
     assert state_of(endpoint) is PlantState.DRIVEN
 
 
@@ -85,16 +85,9 @@ def test_in_real_time_no_frame_holds_for_the_watchdogs_time_and_an_empty_one_is_
         endpoint, plant = claimed(wire_of("on_change", policy))
         for k in range(1, 80):
             endpoint.tick(command(k - 1) if k in (1, 16) else frame, k)
-        assert plant.held == [volts()] * (15 + WATCHDOG_TICKS) + [OFF] * (79 - 15 - WATCHDOG_TICKS)
+        assert plant.periods == [volts()] * (15 + WATCHDOG_TICKS) + [OFF] * (79 - 15 - WATCHDOG_TICKS)
         assert endpoint.trip is TripCause.COMMAND_TIMEOUT
         assert (endpoint.accepted, endpoint.refused) == (2, 0 if frame is None else 14 + WATCHDOG_TICKS)
-
-
-def test_an_empty_command_in_lockstep_is_refused_where_commands_are_periodic() -> None:
-    endpoint, _ = claimed(wire_of("on_change", "periodic"), lockstep=True)
-    endpoint.tick(command(0), 1)
-    endpoint.tick(UNCHANGED, 2)
-    assert (endpoint.refused, endpoint.accepted) == (1, 1)
 
 
 def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_none_of_the_last_session() -> None:
@@ -102,12 +95,12 @@ def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_non
     endpoint.tick(command(0, 7), 1)
     for k in range(2, 300):
         endpoint.tick(UNCHANGED, k)
-    assert plant.held == [volts(7)] * 299
+    assert plant.periods == [volts(7)] * 299
     assert (endpoint.accepted, endpoint.refused, state_of(endpoint)) == (299, 0, PlantState.DRIVEN)
     claim_again(endpoint)
     endpoint.tick(None, 300)
     endpoint.tick(UNCHANGED, 301)
-    assert plant.held[299:] == [OFF, OFF]
+    assert plant.periods[299:] == [OFF, OFF]
     assert (endpoint.refused, state_of(endpoint)) == (1, PlantState.GRANTED)
 
 
@@ -120,7 +113,7 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
     endpoint.tick(UNCHANGED, 4)
     plant.now = turning(0.0)
     endpoint.tick(UNCHANGED, 5)
-    assert plant.held == [volts(), volts(), OFF, OFF, OFF]
+    assert plant.periods == [volts(), volts(), OFF, OFF, OFF]
     assert state_of(endpoint) is PlantState.DRIVEN
     endpoint.tick(UNCHANGED, 6)  # answers a valid measurement
     assert endpoint.trip is TripCause.INVALID_COMMAND
@@ -143,7 +136,7 @@ def test_a_heartbeat_without_a_valid_value_is_forgiven_as_long_as_a_measurement_
     for later in range(HEARTBEAT):
         endpoint.tick(invalid(k + later), k + later + 1)
         assert state_of(endpoint) is PlantState.DRIVEN
-        assert plant.held[-1] == OFF
+        assert plant.periods[-1] == OFF
     endpoint.tick(invalid(k + HEARTBEAT), k + HEARTBEAT + 1)
     assert endpoint.trip is TripCause.INVALID_COMMAND
 

@@ -11,10 +11,9 @@ from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent, batches_per_s
-from aeroloop.protocol.transport.history import KEPT_S
+from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
-from aeroloop.protocol.wire.transmit import UNCHANGED, Transmit
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.plant_stage import RUN, Stage
 
 LOOP = LoopSettings(realtime="off", trace_s=10)
@@ -55,6 +54,19 @@ def inject(text: str) -> Callable[[Stage], None]:
         stage.driver.inject([Fault.parse(text)])
 
     return do
+
+
+def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_took() -> None:
+    """The controller derives the grid from it; one sent late would put it ticks back."""
+
+    def held_up() -> int:
+        return 5 if stage.endpoint.session is not None and not stage.sent else 0
+
+    stage = Stage(LOOP, WIRE, PLANT, between=at({4: Stage.claim}), answer=answer, skip=held_up)
+    batches = stage.run(20).batches
+    assert rows(batches, "tick") == list(range(11, 21))
+    assert [WIRE.measurement.counter(frame) for frame in stage.sent] == list(range(10))
+    assert stage.skipped == 0  # what was held up is before the session
 
 
 def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
@@ -150,15 +162,6 @@ def test_commands_that_a_fault_keeps_back_are_withheld_and_in_their_rows() -> No
     assert operations(batches)[-1] == PlantChange(tick=40, kind="inject", name="command:off@0..0.02")
 
 
-def test_silence_is_a_row_with_the_measurement_not_sent() -> None:
-    wire = WireSpec(transmit=Transmit(measurement="on_change"))
-    still = PLANT.model_copy(update={"ideal": True})
-    batches = Stage(LOOP, wire, still, between=at({0: Stage.claim}), answer=answer).run(40).batches
-    sent_as = rows(batches, "sent_as")
-    assert sent_as[:3] == [Sent.FRAME, Sent.SILENT, Sent.SILENT]
-    assert len(sent_as) == 39
-
-
 def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> None:
     seen: dict[int, int] = {}
 
@@ -192,9 +195,3 @@ def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:
     expired = operations(batches)[1]
     assert (expired.kind, expired.tick, expired.cause) == ("expire", 20, TripCause.NO_ANSWER)
     assert rows(batches, "session_tick") == [*range(21), *range(20)]
-
-
-@pytest.mark.parametrize("loop", [LoopSettings(), LoopSettings(rate_hz=10_000), LoopSettings(lockstep=True)])
-def test_the_cache_holds_what_a_session_publishes_in_its_time(loop: LoopSettings) -> None:
-    rate_hz = 10_000 if loop.lockstep else loop.rate_hz
-    assert batches_per_s(loop) * KEPT_S >= max(KEPT_S / loop.trace_s, KEPT_S * rate_hz / MAX_ROWS)

@@ -99,17 +99,6 @@ def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
     assert [m.attitude for m in seen] == [sample(k).attitude for k in range(1, 9)]
 
 
-def test_an_injected_fault_begins_at_the_tick_that_its_decimals_mean() -> None:
-    """In floats, 0.1 + 0.2 > 0.3."""
-    plant, _ = faulty()
-    plant.advance()
-    inject(plant, "rate:off@0.2")
-    plant.advance()
-    assert not missing(plant.measure().rate)
-    plant.advance()
-    assert missing(plant.measure().rate)
-
-
 def test_motors_fail_and_recover_under_a_held_voltage_and_one_stuck_at_once_keeps_what_it_had() -> None:
     plant, stand = faulty("motor1:off@0.3..0.6", "motor2:stuck", started=False)
     plant.actuate((5.0, 4.0))

@@ -158,15 +158,6 @@ def test_every_frame_sample_and_voltage_that_a_fault_changed_is_counted(fault: s
     assert (status.changed, status.effect) == (changed, effect)
 
 
-def test_a_fault_goes_on_without_a_session_and_its_end_names_none() -> None:
-    def release(run: Run) -> None:
-        if run.endpoint.ticked == 100:
-            run.endpoint.release("s1")
-
-    run = Run("rate:bias=0.1@0.1..0.3", between=release).run(300)
-    assert [(notice.session, notice.tick) for notice in run.events] == [("s1", 48), (None, None)]
-
-
 def test_frames_held_back_for_a_session_are_lost_with_it() -> None:
     """0.1 s are 50 ticks, before which the next session has none to pass."""
     sent: dict[int, int] = {}
@@ -179,10 +170,3 @@ def test_frames_held_back_for_a_session_are_lost_with_it() -> None:
 
     Run("measurement:delay=0.1", between=operator).run(200)
     assert 0 < sent[100] == sent[145] < sent[199]
-
-
-def test_of_faults_one_of_which_is_refused_none_is_injected() -> None:
-    emulator = Run().emulator
-    with pytest.raises(ValueError, match="the plant has no motor3"):
-        emulator.inject([Fault.parse("motor1:off"), Fault.parse("motor3:off")], clear=True)
-    assert (emulator.fault_statuses(), emulator.endpoint.changes, emulator.endpoint.notices) == ([], [], [])

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from math import cos, sin
+from threading import Event
 from typing import Any
 
 import pytest
 
+from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
 from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
-from tests.support.own_plants import Turntable
+from tests.support.own_laws import Node, cycle
+from tests.support.own_plants import Turntable, TurntableSettings
 from tests.support.plant_stage import Stage
 
 HERE = "tests.support.own_plants"
@@ -100,11 +104,6 @@ def test_a_failed_plant_is_replayed_up_to_its_failure() -> None:
     assert "Turntable failed in measure()" in (results[1].stopped or "")
 
 
-def test_nan_trips_by_the_limit_of_invalid_values() -> None:
-    stage = stage_of("Turntable", WireSpec(actuators=1), {"gives": "nan"}, [], lockstep=False).run(100)
-    assert stage.endpoint.trip is TripCause.SENSORS
-
-
 @pytest.mark.parametrize(
     ("kind", "wire", "faults", "line"),
     [
@@ -148,3 +147,39 @@ def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch:
     assert stage.skipped == 2
     assert inner_of(stage)._angle != 0
     assert cos(inner_of(stage)._angle) < 1
+
+
+class Cyclic(Turntable):
+    """Makes two objects a tick that refer to each other."""
+
+    def advance(self) -> None:
+        super().advance()
+        cycle()
+
+
+@pytest.fixture
+def _collector_off() -> Iterator[None]:
+    """As `prepare_process` leaves it."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+@pytest.mark.usefixtures("_collector_off")
+def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_without() -> None:
+    loop, wire, settings = LoopSettings(realtime="off", trace_s=10), WireSpec(actuators=1), PlantSettings(watchdog_s=10)
+    driver = Driver(Cyclic(TurntableSettings(), loop.period), loop, wire, settings, stop := Event())
+
+    def between(stage: Stage) -> None:
+        if stage.endpoint.ticked == 3000:
+            stage.claim()
+
+    stage = Stage(loop, wire, settings, driver=driver, between=between)
+    stage.stop = stop
+    before = Node.alive
+    stage.run(6000)
+    assert len(stage.sent) > 200  # until no first command came
+    assert Node.alive - before < 2_000  # of 12 000

@@ -206,12 +206,6 @@ def test_a_row_that_was_changed_is_found(row: int, bit: int, column: str) -> Non
     assert result.first_difference.logged != result.first_difference.computed
 
 
-def test_a_plant_of_other_settings_differs() -> None:
-    loop, wire, batches = undisturbed()
-    other = PLANT.model_copy(update={"wind": WindSettings(blowing=True, seed=1)})
-    assert replayed(loop, wire, other, batches).differ > 300
-
-
 def test_batches_that_come_again_are_passed_over() -> None:
     loop, wire, plant, batches = traced(3)
     again = [batch for i in range(len(batches)) for batch in batches[max(0, i - 3) : i + 1]]

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
@@ -117,26 +116,6 @@ def test_the_free_body_agrees_with_the_equations_at_moving_states_under_loads() 
             assert np.linalg.norm(got - expected) <= 1e-12 * np.linalg.norm(expected)
 
 
-def test_wind_and_friction_act_on_the_body_as_voltages_and_damping_would() -> None:
-    """A steady wind is B u; viscous friction about the axes is θ."""
-    torque, theta = (0.01, -0.02, 0.015), (0.01, 0.02, 0.03)
-    calm = RigidBodySettings(damping=theta, rate=(1.0, -2.0, 3.0))
-    driven = _free(calm)
-    blown = _free(
-        calm.model_copy(update={"damping": (0.0, 0.0, 0.0)}),
-        wind=WindSettings(blowing=True, torque=torque, gust=0.0),
-        friction=FrictionSettings(viscous=theta, coulomb=()),
-    )
-    driven.actuate([t / 0.01 for t in torque])
-    for _ in range(200):
-        driven.advance()
-        blown.advance()
-    # rounding of 400 steps, of rates up to 4 rad/s
-    assert blown.truth().rate == pytest.approx(driven.truth().rate, abs=1e-12)
-    assert blown.truth().attitude == pytest.approx(driven.truth().attitude, abs=1e-12)
-    assert np.abs(np.array(blown.truth().rate) - calm.rate).max() > 0.5  # and both did act
-
-
 # ── what a body keeps ──
 
 
@@ -180,22 +159,6 @@ def test_a_body_without_damping_keeps_its_energy_and_momentum_through_full_turns
         assert sum(a != b for a, b in pairwise(signs)) >= 8  # η passes zero twice in two turns; nearly ten in 20 s
 
 
-def test_the_aero_without_damping_and_input_keeps_its_energy() -> None:
-    plant = _aero(LOSSLESS, 0.02)
-    plant.actuate((20.0, -10.0))  # it pitches and yaws at 1 rad/s or so, then motors off
-    for _ in range(50):
-        plant.advance()
-    plant.actuate((0.0, 0.0))
-    kinetic, energy, _ = _kept(LOSSLESS, plant)
-    assert np.linalg.norm(plant.truth().rate) > 0.5
-    for _ in range(1000):
-        plant.advance()
-        # A Runge–Kutta step of fourth order takes (ω h)⁶/72 of an oscillation's energy; ω = 2 rad/s of pendulum and
-        # spin together, h = 0.01 s, 2000 steps. One of third order would take (ω h)⁴/12 a step, a thousand times as
-        # much.
-        assert abs(_kept(LOSSLESS, plant)[1] - energy) <= 2000 * (2 * 0.01) ** 6 / 72 * kinetic
-
-
 def test_the_quaternion_is_unit_from_the_start_on_and_never_jumps() -> None:
     body = TUMBLING.model_copy(update={"rate": (3.0, 20.0, 3.0), "attitude": (-0.1, 0.2, -0.2, 0.4)})
     plant = _free(body)  # so fast that a step alone stretches it by 1e-9
@@ -229,20 +192,3 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
     for coarse, fine in pairwise(errors):
         # 16 in the limit; the next order's terms still show a little. Orders 3 and 5 would give 8 and 32.
         assert 14 < coarse / fine < 18
-
-
-def test_the_aeros_attitude_turns_with_its_rates() -> None:
-    """(C.1): q̇ = ½ q ⊗ [0, ω], by a central difference."""
-    period = 1e-3
-    plant = _aero(IDEAL_AERO, period)
-    plant.actuate((24.0, 10.0))
-    states = []
-    for _ in range(1000):
-        plant.advance()
-        states.append(plant.truth())
-    for before, at, after in zip(states, states[1:], states[2:], strict=False):
-        (w, x, y, z), (a, b, c) = at.attitude, at.rate
-        expected = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-        moved = (np.array(after.attitude) - np.array(before.attitude)) / period
-        # period²/6 of the third derivative, which is below 10 here
-        assert np.abs(moved - expected).max() <= 2e-6

@@ -10,20 +10,17 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from aeroloop.plant_emulator.model.aero import Aero, AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
 from aeroloop.plant_emulator.model.emulated import (
     FrictionSettings,
     RotorSettings,
     friction_torque,
-    rotor_derivative,
     step_function,
-    thrust_voltage,
 )
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Measurement, State
 from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
-from aeroloop.protocol.wire.attitude import IDENTITY
 from tests.support.numpy_twin import Array
 
 PERIOD = 0.002
@@ -59,11 +56,6 @@ def test_a_rotor_follows_with_the_time_constant_of_the_direction(start: float, c
         assert float(x[5]) == pytest.approx(expected, abs=1e-8)
 
 
-def test_a_rotor_that_reverses_falls_with_the_down_lag_before_it_rises_with_the_up_lag() -> None:
-    falling, rising, from_rest = (float(rotor_derivative(ROTOR, ca.SX(v), ca.SX(-10.0))) for v in (5.0, -1.0, 0.0))
-    assert [falling, rising, from_rest] == pytest.approx([-15 / DOWN, -9 / UP, -10 / UP], rel=1e-15)
-
-
 def test_thrust_lags_behind_the_voltage_and_begins_beyond_the_dead_zone() -> None:
     """A weightless body's rate is the integral of the thrust: B V/J (t − τ (1 − exp(−t/τ))).
 
@@ -88,13 +80,6 @@ def test_thrust_lags_behind_the_voltage_and_begins_beyond_the_dead_zone() -> Non
     assert (periods - 1) * PERIOD <= UP * np.log(2) <= periods * PERIOD
 
 
-def test_a_dead_zone_takes_its_width_away_from_the_voltage() -> None:
-    v = ca.SX.sym("v")
-    zone, none = (ca.Function("f", [v], [thrust_voltage(RotorSettings(dead_zone_v=size), v)]) for size in (2.5, 0.0))
-    for voltage, left in ((0.0, 0.0), (2.5, 0.0), (-2.5, 0.0), (1.0, 0.0), (3.0, 0.5), (-3.0, -0.5), (24.0, 21.5)):
-        assert (float(zone(voltage)), float(none(voltage))) == (left, voltage)
-
-
 # ── friction ──
 
 
@@ -117,15 +102,6 @@ def test_viscous_friction_is_in_proportion_to_the_rate_and_coulomb_friction_cons
     assert torque(np.array([-0.2, -5.0, -100.0])).tolist() == c.tolist()
     # tanh(½ ln 3) is ½; some operations of 1e-16
     assert torque(np.full(3, FRICTION.width * np.log(3) / 2)) == pytest.approx(-c / 2, rel=1e-14)
-
-
-@pytest.mark.parametrize("kind", ["viscous", "coulomb"])
-def test_missing_axes_have_no_friction(kind: str) -> None:
-    off = {"viscous": (), "coulomb": ()}
-    torque = _friction(FrictionSettings.model_validate(off | {kind: (0.1,)}), 3)(np.ones(3))
-    assert torque.tolist() == [-0.1, 0.0, 0.0]
-    two = _friction(FrictionSettings.model_validate(off | {kind: (0.1, 0.2, 0.3)}), 2)(np.ones(2))
-    assert two.tolist() == [-0.1, -0.2]  # nor does one too many do any harm
 
 
 @pytest.mark.parametrize("rate", [0.5, -0.5])
@@ -160,19 +136,6 @@ def test_voltages_are_clipped_to_the_supply(commanded: tuple[float, float], held
     assert plant.truth() == other.truth()
 
 
-def test_it_starts_level_at_rest_and_stays_there_without_voltage_as_when_closed() -> None:
-    plant = _with(aero=IDEAL_AERO).build(PERIOD)
-    level = (IDENTITY, (0.0, 0.0, 0.0))
-    assert plant.measure() == level
-    plant.actuate((10.0, -10.0))
-    plant.close()
-    plant.close()  # twice does no harm
-    for _ in range(1000):
-        plant.advance()
-    assert plant.truth() == (*level, (0.0, 0.0))
-    assert plant.measure() == level
-
-
 @pytest.mark.parametrize(
     ("attitude", "rate"), [("encoders", "derivative"), ("encoders", "perfect"), ("perfect", "derivative")]
 )
@@ -184,14 +147,6 @@ def test_encoders_on_a_free_body_are_refused_with_what_to_set(attitude: str, rat
         assert word in str(refused.value)
     assert PlantSettings.model_validate(free | {"kind": "aero"}).sensors.attitude == attitude
     assert PlantSettings.model_validate(free | {"ideal": True}).build(PERIOD).actuators == 3
-
-
-@pytest.mark.parametrize("rate", ["gyro", "perfect"])
-def test_a_free_body_with_sensors_that_need_no_joints_is_built(rate: str) -> None:
-    settings = PlantSettings.model_validate(
-        {"kind": "rigid_body", "sensors": {"attitude": "perfect", "rate": rate}, "rigid_body": {"rate": (1, 2, 3)}}
-    )
-    assert settings.build(PERIOD).measure() == (IDENTITY, (1.0, 2.0, 3.0))
 
 
 @pytest.mark.parametrize(
@@ -224,33 +179,6 @@ def _driven(settings: PlantSettings, periods: int = 300) -> list[tuple[State, Me
         plant.advance()
         seen.append((plant.truth(), plant.measure()))
     return seen
-
-
-def test_with_every_piece_off_the_plant_is_the_bare_mechanism() -> None:
-    """Its equations of motion, in a Runge–Kutta step typed here."""
-    p = AeroSettings(inertia=(0.02, 0.03, 0.04), damping=(0.01, 0.02, 0.03))
-    dynamics = aero_dynamics(p)
-
-    def slope(x: Array, u: tuple[float, ...]) -> Array:
-        return np.array(dynamics(x, u, np.zeros(2)), dtype=np.float64).ravel()
-
-    x, h = np.zeros(4), PERIOD / BARE.substeps
-    for k, (state, measured) in enumerate(_driven(_with(aero=p), 200)):
-        u = _voltages(k)[:2]
-        for _ in range(BARE.substeps):
-            a = slope(x, u)
-            b = slope(x + h / 2 * a, u)
-            c = slope(x + h / 2 * b, u)
-            d = slope(x + h * c, u)
-            x = x + h / 6 * (a + 2 * b + 2 * c + d)
-        pitch, yaw = (float(angle) / 2 for angle in x[:2])
-        q = [cos(yaw) * cos(pitch), -sin(yaw) * sin(pitch), cos(yaw) * sin(pitch), sin(yaw) * cos(pitch)]
-        omega = [-sin(x[0]) * x[3], x[2], cos(x[0]) * x[3]]
-        # the same operations: rounding of some tens a step, 400 steps, of values up to 1
-        assert state.attitude == pytest.approx(q, abs=1e-13)
-        assert state.rate == pytest.approx(omega, abs=1e-13)
-        assert state.voltages == u
-        assert measured == (state.attitude, state.rate)
 
 
 GUSTY = PlantSettings(wind=WindSettings(blowing=True, gust=0.5), rotor=RotorSettings(dead_zone_v=1.0))

@@ -1,18 +1,20 @@
-"""Sensors: encoders in whole counts, the filtered derivative, the gyro's noise and bias; against closed solutions.
+"""Sensors and wind against closed solutions: encoders, the filtered derivative, a gyro's noise and bias; gusts.
 
 Random numbers are seeded; a tolerance is five standard deviations of the estimate.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, exp, inf, pi, sin, sqrt
+from math import atan2, cos, exp, hypot, inf, pi, sin, sqrt
 
 import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.sensors import FilteredDerivative, Sensors, SensorSettings
+from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
 from tests.support import numpy_twin as twin
+from tests.support.numpy_twin import Array
 
 PERIOD = 0.002
 OMEGA_N, ZETA = 50.0, 0.8
@@ -70,28 +72,6 @@ def test_encoders_read_whole_counts_within_one_count_of_the_truth() -> None:
     assert (spread > 0.98).all()
 
 
-def _zero(axis: int, seed: int) -> float:
-    """Where within a count an encoder is zeroed: how much of the count from 0 on it already reads as 1."""
-    sensors = _sensors(rate="perfect", seed=seed, counts=(1000, 1000))
-    step = 2 * pi / 1000
-    read = 0
-    for k in range(64):
-        angles = [0.0, 0.0]
-        angles[axis] = (k + 0.5) / 64 * step
-        read += _angles(sensors.read(IDENTITY, AT_REST, angles).attitude)[axis] > step / 2
-    return read / 64
-
-
-def test_the_seed_shifts_the_zero_anywhere_within_a_count() -> None:
-    zeros = np.array([[_zero(axis, seed) for axis in (0, 1)] for seed in range(100)])
-    assert _zero(0, 7) == zeros[7, 0]  # and always to the same place
-    # An even spread over 0…1 has the mean ½, the deviation 1/√12 and the kurtosis 1.8: of n seeds the mean is known to
-    # 1/√(12 n), the deviation to ½ √(0.8/n) of itself, a correlation to 1/√n. A 64th is as fine as `_zero` looks.
-    assert zeros.mean(axis=0) == pytest.approx([0.5, 0.5], abs=5 / sqrt(1200))
-    assert zeros.std(axis=0) * sqrt(12) == pytest.approx([1, 1], rel=5 * 0.5 * sqrt(0.8 / 100))
-    assert abs(np.corrcoef(zeros.T)[0, 1]) < 5 / sqrt(100)
-
-
 def test_the_attitude_of_encoders_is_yaw_then_pitch() -> None:
     """R_z(yaw) R_y(pitch), multiplied out as matrices."""
     sensors = _sensors(rate="perfect", counts=FINE)
@@ -113,16 +93,6 @@ def test_the_rate_of_encoders_is_that_of_the_joints_in_the_body_frame() -> None:
         _, rate = sensors.read(IDENTITY, AT_REST, [p, dy * k * PERIOD])
     # The ripple of a held ramp, (ωn T)²/12 and a tenth for the next order. Counts of l shake it by less than ωn l.
     assert rate == pytest.approx([-sin(p) * dy, dp, cos(p) * dy], abs=0.9 * (50 * PERIOD) ** 2 / 12 * 1.1 + 50 * 1.5e-6)
-
-
-def test_the_derivative_is_of_the_angles_as_counted() -> None:
-    """At rest but for less than a count there is no rate; a count is a step, and its rate the step's response."""
-    step = 2 * pi / 2048
-    sensors = _sensors(counts=(2048, 4096), seed=1)
-    assert all(sensors.read(IDENTITY, AT_REST, [0.0, 0.0]).rate == AT_REST for _ in range(10))
-    for n in range(1, 50):
-        _, rate = sensors.read(IDENTITY, AT_REST, [step, 0.0])
-        assert rate[1] == pytest.approx(step * _step_response(n * PERIOD), abs=1e-14)  # rounding, of 0.06 rad/s
 
 
 def test_a_gyro_adds_its_noise_and_bias_to_the_true_rate() -> None:
@@ -160,3 +130,61 @@ def test_sensors_of_a_state_that_has_left_the_numbers_have_no_valid_value() -> N
     sensors = Sensors(SensorSettings(), PERIOD)
     attitude, rate = sensors.read((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, inf), (0.0, inf))
     assert all(value != value for value in (*attitude, *rate))
+
+
+# ── wind: a steady torque, and gusts of the configured mean, deviation and memory ──
+
+
+FAN = (-0.003, 0.004)
+"""Its magnitude is 0.005 N·m."""
+
+
+def _blown(n: int, axes: int = 2, period: float = 0.1, **changed: object) -> Array:
+    """n samples of wind. Shape (n, axes)."""
+    settings = WindSettings.model_validate({"blowing": True, "torque": FAN, "gust": 0.0} | changed)
+    wind = Wind(settings, axes, period)
+    return np.array([wind.sample() for _ in range(n)])
+
+
+def test_calm_is_no_torque_whatever_the_gusts_and_without_gusts_it_is_steady() -> None:
+    assert not WindSettings().blowing
+    assert (_blown(5000) == FAN).all()
+    for axes, torque in ((2, (0.1, 0.2)), (3, (0.1, 0.2, 0.0))):
+        assert not _blown(5000, axes, blowing=False, gust=5.0).any()
+        assert (_blown(10, axes, torque=(0.1, 0.2)) == torque).all()  # missing axes are 0
+    assert (_blown(10, 2, torque=(0.1, 0.2, 0.3)) == (0.1, 0.2)).all()
+
+
+def test_gusts_repeat_with_their_seed_and_only_with_it() -> None:
+    n = 5000  # more than one draw of random numbers
+    one, again, other = (_blown(n, gust=0.5, seed=seed) for seed in (1, 1, 2))
+    assert (one == again).all()
+    assert (one != other).all()
+    assert (one[:, 0] != one[:, 1]).all()  # nor do the axes share one gust
+
+
+@pytest.mark.parametrize("period", [0.02, 0.1])
+@pytest.mark.parametrize("axes", [2, 3])
+def test_gusts_have_the_configured_mean_deviation_and_memory_whatever_the_period(axes: int, period: float) -> None:
+    """`gust` is the deviation of the whole torque as a part of the whole steady torque, spread evenly over the axes.
+
+    For a process with autocorrelation ρ^|k| and n samples, the mean has the variance σ²/n (1 + ρ)/(1 − ρ), the variance
+    has 2 σ⁴/n (1 + ρ²)/(1 − ρ²), and the autocorrelation at lag k has, by Bartlett's formula,
+    ((1 + ρ²)(1 − ρ²ᵏ)/(1 − ρ²) − 2k ρ²ᵏ)/n.
+    """
+    n, gust, memory = 100_000, 0.6, 0.5
+    x = _blown(n, axes, period, gust=gust, gust_time_s=memory, seed=3)
+    rho = exp(-period / memory)
+    sigma = gust * hypot(*FAN) / sqrt(axes)
+    steady = np.array((*FAN, 0.0)[:axes])
+    assert np.abs(x.mean(axis=0) - steady).max() < 5 * sigma * sqrt((1 + rho) / (1 - rho) / n)
+    x = x - steady
+    variance = (x * x).mean(axis=0)
+    assert np.abs(variance / sigma**2 - 1).max() < 5 * sqrt(2 * (1 + rho**2) / (1 - rho**2) / n)
+    for seconds in (0.1, 0.5, 1.0):
+        k = round(seconds / period)
+        correlation = (x[k:] * x[:-k]).mean(axis=0) / variance
+        spread = ((1 + rho**2) * (1 - rho ** (2 * k)) / (1 - rho**2) - 2 * k * rho ** (2 * k)) / n
+        assert np.abs(correlation - exp(-seconds / memory)).max() < 5 * sqrt(spread)
+    cross = (x[:, 0] * x[:, 1]).mean() / sigma**2
+    assert abs(cross) < 5 * sqrt((1 + rho**2) / (1 - rho**2) / n)  # the axes are independent

@@ -46,28 +46,27 @@ def processes_of(session: int) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("module", ["typer._click.core", "aeroloop.service.cli.main", "pydantic.main", "numpy"])
-def test_an_interrupted_import_leaves_no_traceback(module: str) -> None:
-    process = start(sys.executable, "-P", "-X", "importtime", "-m", "aeroloop", "lab", "experiment")
+@pytest.mark.parametrize(
+    ("words", "module", "sent", "code", "said"),
+    [
+        ("lab experiment", "typer.main", signal.SIGINT, 130, []),
+        ("lab experiment", "pydantic.main", signal.SIGINT, 130, []),
+        ("lab experiment", "numpy", signal.SIGINT, 130, []),
+        ("recorder", "typer.main", signal.SIGTERM, 0, ["aeroloop: ended by a signal before it had started"]),
+        ("recorder", "zenoh", signal.SIGTERM, 0, ["aeroloop: ended by a signal before it had started"]),
+    ],
+)
+def test_a_signal_during_an_import_leaves_no_traceback(
+    words: str, module: str, sent: int, code: int, said: list[str]
+) -> None:
+    process = start(sys.executable, "-P", "-X", "importtime", "-m", "aeroloop", *words.split())
     assert process.stderr is not None
     while not (line := process.stderr.readline()).rstrip().endswith(f" {module}"):
         assert line, f"{module} was not imported"
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, rest = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 130
-    assert not [line for line in rest.splitlines() if not line.startswith("import time:")]
-
-
-@pytest.mark.parametrize("module", ["typer._click.core", "aeroloop.service.cli.main", "pydantic.main", "zenoh"])
-def test_a_daemon_that_is_terminated_while_it_imports_says_so(module: str) -> None:
-    process = start(sys.executable, "-P", "-X", "importtime", "-m", "aeroloop", "recorder")
-    assert process.stderr is not None
-    while not (line := process.stderr.readline()).rstrip().endswith(f" {module}"):
-        assert line, f"{module} was not imported"
-    process.send_signal(signal.SIGTERM)
-    _, rest = process.communicate(timeout=PATIENCE_S)
-    said = [line for line in rest.splitlines() if not line.startswith("import time:")]
-    assert (process.returncode, said) == (0, ["aeroloop: ended by a signal before it had started"])
+    assert process.returncode == code
+    assert [line for line in rest.splitlines() if not line.startswith("import time:")] == said
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])
@@ -84,7 +83,7 @@ def test_a_daemon_that_is_terminated_while_zenoh_is_opened_ends_at_once_and_says
 
 TERMINATED_IN_WAIT = """
 import os, signal, sys, threading
-from aeroloop.service.cli.common import DaemonOptions, run_alone
+from aeroloop.service.cli.common import run_alone
 
 def trace(frame, event, _):
     if frame.f_code is threading.Condition.wait.__code__:  # the event's lock is held
@@ -94,7 +93,7 @@ def run(stop):
     sys.settrace(trace)
     stop.wait()
 
-run_alone(run, DaemonOptions())
+run_alone(run)
 """
 
 
@@ -107,30 +106,33 @@ def test_a_daemon_that_is_terminated_just_as_it_begins_to_wait_ends() -> None:
         process.communicate()
 
 
-@pytest.mark.parametrize("verb", ["tables", "calibrate"])
-def test_worker_processes_end_in_silence(verb: str) -> None:
-    process = start(*COMMAND, "lab", verb)
+def wait_for_workers(process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while len(processes_of(process.pid)) < 3:  # this one, multiprocessing's tracker and a worker, which imports first
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
-    _, printed = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, printed) == (130, "")
+
+
+def wait_until_none_is_left(process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
     while processes_of(process.pid):  # the tracker ends when its pipe is closed
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
 
+def test_worker_processes_end_in_silence() -> None:
+    process = start(*COMMAND, "lab", "tables")
+    wait_for_workers(process)
+    os.killpg(process.pid, signal.SIGINT)
+    _, printed = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, printed) == (130, "")
+    wait_until_none_is_left(process)
+
+
 def test_workers_end_with_a_parent_that_is_killed() -> None:
     process = start(*COMMAND, "lab", "tables")
-    deadline = time.monotonic() + PATIENCE_S
-    while len(processes_of(process.pid)) < 3:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for_workers(process)
     process.kill()
     process.communicate(timeout=PATIENCE_S)
-    while processes_of(process.pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until_none_is_left(process)

@@ -20,9 +20,9 @@ from aeroloop.protocol.messages.operator import Hold, Reference, Sinusoid
 from aeroloop.service.control.motion import (
     LEAST_TURN_S,
     Approach,
-    Motion,
     approached,
     shortest,
+    shortest_from_rest,
     to_set_point,
 )
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
@@ -85,7 +85,7 @@ def after(history: list[tuple[Reference, float, float]], limits: Limits) -> tupl
     """A motion after some changes, each as early as possible or later by a time, and the time of the next [s]."""
     followed, t = Followed(Hold()), 0.0
     for reference, longer_s, passed in history:
-        approach = followed.motion.shortest(Plan.of(reference), t, limits)
+        approach = shortest(Plan.of(reference), followed.motion.here(t), limits)
         followed.approach(reference, t, approach.at_least(approach.within_s + longer_s))
         t += passed
     return followed, t
@@ -163,7 +163,7 @@ def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
 ) -> None:
     followed, t = after(history, BODY)
     target = Plan.of(reference)
-    approach = followed.motion.shortest(target, t, BODY)
+    approach = shortest(target, followed.motion.here(t), BODY)
     approach = approach.at_least(approach.within_s + longer_s)
     followed.approach(reference, t, approach)
     angles, _, _ = way(followed.plan, target, t + approach.within_s)
@@ -274,7 +274,7 @@ def test_what_is_too_short_is_refused_with_what_takes_so_long_and_the_time_that_
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_what_is_too_far_for_any_time_is_refused() -> None:
     with pytest.raises(FollowError, match="too far"):
-        Motion(Hold()).shortest(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), 0.0, BENCH)
+        shortest_from_rest(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), (0.0, 0.0, 0.0), BENCH)
 
 
 def test_a_way_that_tilts_further_than_both_its_ends_is_refused_as_no_time_would_help() -> None:
@@ -283,7 +283,7 @@ def test_a_way_that_tilts_further_than_both_its_ends_is_refused_as_no_time_would
     start, target = (130.0, 50.0, 0.0), Hold(attitude=(130.0, -130.0, 0.0))
     Plan.of(target).check(limits)
     with pytest.raises(FollowError, match=r"the approach tilts by 130\.0°, more than .*, however long it takes"):
-        Motion(Hold()).shortest(Plan.of(target), 0.0, limits, start)
+        shortest_from_rest(Plan.of(target), start, limits)
 
 
 # Rest
@@ -298,15 +298,12 @@ def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Re
     assert rest.attitude is not None
     away = np.abs(np.radians(rest.attitude) - angle)
     assert np.all(away <= stopping(here((angle, rate, acceleration)), BODY.braking) + 1e-9)
-    approach = followed.motion.shortest(Plan.of(rest), t, BODY)
+    approach = shortest(Plan.of(rest), followed.motion.here(t), BODY)
     assert approach.within_s == pytest.approx(max(approach.brake_s or (0.0,)) + LEAST_TURN_S)
     followed.approach(rest, t, approach)
     for later in (approach.within_s + 1e-9, 9.0 + approach.within_s):
         assert not np.any(followed.at(t + later)[1])
         assert not np.any(followed.at(t + later)[2])
-
-
-# From the attitude of a body
 
 
 # Set-points of a stream

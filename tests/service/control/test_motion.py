@@ -170,20 +170,6 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
             assert np.abs(left - right).max() <= tolerance
 
 
-def test_the_attitude_moves_as_the_velocity_says_and_that_as_the_acceleration() -> None:
-    """(C.12) by central differences, which err by h²/6 of third derivatives, below 100 of q and 600 of ω here."""
-    followed, h = Followed(Sinusoid(amplitude=(30.0, 60.0, 250.0), frequency=(2.3, 0.7, 1.1))), 1e-3
-    for t in np.linspace(h, 50.0, 401):
-        (q0, w0, _), (q1, w1, dw1), (q2, w2, _) = (followed.at(t + step) for step in (-h, 0.0, h))
-        w, x, y, z = q1
-        a, b, c = w1
-        moves = 0.5 * np.array(  # row by row: ½ [−ε_dᵀ; η_d I − S(ε_d)] ω_d
-            [-x * a - y * b - z * c, w * a + z * b - y * c, -z * a + w * b + x * c, y * a - x * b + w * c]
-        )
-        assert np.abs((q2 - q0) / (2 * h) - moves).max() <= 2e-5
-        assert np.abs((w2 - w0) / (2 * h) - dw1).max() <= 1e-4
-
-
 # Arriving
 
 
@@ -289,6 +275,10 @@ TILTED_POINTS = Points(times=[0.0, 4.0, 8.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 
         (TOO_TILTED, BENCH, "max_reference_tilt_deg"),
         (TILTED_BY_BOTH, BODY, "max_reference_tilt_deg"),  # neither alone is too much: acos(cos² 50°) = 65.6°
         (TILTED_POINTS, BENCH, "max_reference_tilt_deg"),
+        # sampled where pitch is 0, each time; beyond 60° only after 848 s; and any
+        (Sinusoid(amplitude=(0.0, 80.0, 1.0), frequency=(0.0, 0.7, 0.7 / 32)), BENCH, "max_reference_tilt_deg"),
+        (Sinusoid(amplitude=(0.0, 80.0, 0.0), frequency=(0.0, 0.001, 0.0)), BENCH, "max_reference_tilt_deg"),
+        (Sinusoid(amplitude=(0.0, 360.0, 1.0), frequency=(0.0, 0.15, 0.0005)), BENCH, "max_reference_tilt_deg"),
         (Hold(attitude=(0.0, -60.1, 0.0)), BENCH, "max_reference_tilt_deg"),
         (Hold(attitude=(0.0, 180.0, 0.0)), BENCH, "max_reference_tilt_deg"),
         (ROLLS, BENCH, "roll"),
@@ -320,19 +310,6 @@ def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
 )
 def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limits: Limits) -> None:
     Plan.of(reference).check(limits)
-
-
-@pytest.mark.parametrize(
-    "reference",
-    [
-        Sinusoid(amplitude=(0.0, 80.0, 1.0), frequency=(0.0, 0.7, 0.7 / 32)),  # sampled where pitch is 0, each time
-        Sinusoid(amplitude=(0.0, 80.0, 0.0), frequency=(0.0, 0.001, 0.0)),  # beyond 60° only after 848 s
-        Sinusoid(amplitude=(0.0, 360.0, 1.0), frequency=(0.0, 0.15, 0.0005)),
-    ],
-)
-def test_a_sinusoid_that_tilts_too_far_at_any_time_is_refused(reference: Sinusoid) -> None:
-    with pytest.raises(FollowError):
-        Plan.of(reference).check(BENCH)
 
 
 def test_a_sinusoid_that_is_too_fast_only_after_many_periods_is_refused() -> None:
@@ -370,15 +347,3 @@ def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hol
     # 1e-9: rounding of terms 15 (5/T) times the angles, at most 400, that cancel; in what is hardly moving, too.
     assert plan.fastest() <= fastest * (1 + 1e-9) + 1e-9
     assert fastest <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES + 1e-9
-
-
-@settings(max_examples=40)
-@given(amplitude=triples(60), frequency=frequencies)
-def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
-    amplitude: tuple[float, float, float], frequency: float
-) -> None:
-    followed = Followed(Sinusoid(amplitude=amplitude, frequency=(frequency,) * 3))
-    period = 2 * pi / frequency if frequency else 1.0
-    fastest = max(np.linalg.norm(followed.at(t)[1]) for t in np.linspace(0, period, DENSE))
-    # So many times a period are at most 0.002 rad from a crest, and ω² there has harmonics up to the third or so.
-    assert fastest * (1 - 1e-9) <= followed.plan.fastest() <= fastest * (1 + 5e-5) + 1e-9

@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Message, Points, Reference, Sinusoid, Stream, Track
-from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, Loop, gains_with, measured, turned
+from tests.support.operated_loop import LAW, LEVEL, PERIOD, Loop, gains_with, measured, turned
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
 LATER_TOO_FAST = Points(
@@ -60,9 +58,9 @@ def test_gains_that_change_nothing_are_answered_and_publish_no_event(loop: Loop,
 @pytest.mark.parametrize(
     ("topic", "payload", "why"),
     [
-        ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "at most 20"),
+        ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "law.C1[2]: should be less than or equal to 20"),
         ("set_gains", b'{"C9": [1, 1, 1]}', "no gain C9; it has C1, C2, Gamma"),
-        ("set_gains", b'{"C1": [0.3, 0.0, 0.3]}', "every element must be positive"),
+        ("set_gains", b'{"C1": [0.3, 0.0, 0.3]}', "law.C1[1]: should be greater than 0"),
         ("set_gains", b'{"C2": [0.3, 0.3]}', "law.C2"),
         ("set_gains", b'{"C2": 0.3}', "law.C2"),
         ("set_gains", b'{"mass": 2}', "no gain mass"),
@@ -132,15 +130,6 @@ def test_a_reference_holds_from_the_tick_that_is_published_and_arrives(
     assert loop.controller.desired == there.desired
 
 
-def test_a_sinusoid_begins_where_it_is_reached(loop: Loop) -> None:
-    loop.run(0.1)
-    loop.ask("track", Track(reference=SWING, within_s=1.0))
-    loop.run(1.0 + 0.5)
-    reached = loop.fresh(SWING)
-    reached.tick(measured(0), loop.k - 1 - 550)  # asked for at tick 50, reached 500 later
-    assert loop.controller.desired == pytest.approx(reached.desired, abs=1e-14)  # times of a few s, rounded
-
-
 @pytest.mark.parametrize("reference", [Hold(attitude=None), Stream()])
 def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop, reference: Reference) -> None:
     loop.ask("track", Track(reference=Sinusoid(amplitude=(0.0, 0.0, 20.0), frequency=(0.0, 0.0, 0.4)), within_s=0.5))
@@ -177,26 +166,6 @@ def test_a_session_that_begins_far_from_its_reference_goes_there_from_where_the_
         loop.tick(turned(90.0))
     assert loop.yaw() == pytest.approx(0.0, abs=1e-9)
     assert len(loop.changes()) == 2
-
-
-def test_a_session_that_begins_near_its_reference_follows_it_at_once(loop: Loop) -> None:
-    loop.end()
-    loop.begin()
-    loop.tick(turned(15.0))
-    assert [change.tick for change in loop.changes()] == [0]
-
-
-def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: Loop) -> None:
-    loop.ask("set_gains", Gains(C2=(0.4, 0.4, 0.4)))
-    loop.ask("track", Track(reference=SWING, within_s=0.5))
-    loop.run(1.0)
-    loop.end()
-    loop.begin()
-    gains = gains_with(C2=(0.4, 0.4, 0.4))
-    assert loop.changes() == [Change(session="s1", tick=0, gains=gains, reference=SWING)]
-    expected = Controller(WIRE, AdaptiveSettings(C2=(0.4, 0.4, 0.4)), SWING, PERIOD)
-    for k in range(100):
-        assert loop.tick() == expected.tick(measured(k), k)
 
 
 # The log

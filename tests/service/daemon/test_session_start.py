@@ -96,19 +96,6 @@ def test_held_is_the_attitude_found_and_it_stays_there_until_an_operator_moves_i
     loop.assert_it_runs_again()
 
 
-def test_after_a_trip_too_the_vehicle_is_held_where_it_is_found_with_the_operators_gains() -> None:
-    loop = of("hold")
-    loop.begin()
-    asked(loop)
-    loop.end()
-    assert (loop.live.record.session, loop.live.record.reference) == (None, Hold())
-    assert start(loop, 30.0, record(TARGET)) == pytest.approx(30.0, abs=1.0)
-    assert reached(loop, 25.0) == pytest.approx(30.0, abs=1.0)  # where it was found first
-    assert loop.controller.gains == GAINS
-    assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("held", "operator")
-    loop.assert_it_runs_again()
-
-
 def test_nothing_is_held_before_there_is_a_valid_measurement() -> None:
     loop = of("hold")
     loop.begin()

@@ -171,14 +171,6 @@ def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes) -> None:
     assert [each.frame for each in ticks if in_passing(each)] == [nonsense] * 8
 
 
-def test_a_frame_that_nonsense_follows_at_once_keeps_its_levels() -> None:
-    both = [arrival(5, 9, late_ns=HALF_NS - 10), arrival(5, late_ns=HALF_NS - 10, content=b"\0")]
-    source = Source([arrival(0), *both])
-    ticks = source.run(until(6))
-    assert [each.frame for each in ticks if each.tick >= 4] == [UNCHANGED, frame(5, 9), b"\0", UNCHANGED, UNCHANGED]
-    assert source.ticks == list(range(7))
-
-
 def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None:
     contents = [frame(0), *[UNCHANGED] * 14, frame(15), *[UNCHANGED] * 3]
     arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
@@ -209,16 +201,6 @@ def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(phase_ns: int
     assert len(source.ticks) > last - 5
     assert sorted(set(source.ticks)) == source.ticks
     assert sum(each.missed for each in ticks) <= 1
-
-
-def test_on_a_grid_of_ones_own_what_has_piled_up_is_caught_up_with_at_once() -> None:
-    source = Source([arrival(k, k % 5) for k in range(100)], own_grid=True)
-    source.run(until(9))
-    source.link.pass_time(until(14))
-    source.run(until(60))
-    behind = [at_ns - each.tick * PERIOD_NS - DELAY_NS for each, at_ns in source.taken if each.tick > 15]
-    assert max(behind) < PERIOD_NS
-    assert source.ticks[-40:] == list(range(source.ticks[-1] - 39, source.ticks[-1] + 1))
 
 
 # Where every tick has a frame

@@ -17,20 +17,17 @@ from matplotlib.image import imread
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.transmit import Sender
 from aeroloop.service.cli.main import execute
-from aeroloop.service.config import Settings, load
+from aeroloop.service.config import load
 from aeroloop.service.lab.burden import (
     BITS,
     POLICIES,
     QUANTIZERS,
     SENSORS,
     Burden,
-    BurdenError,
-    Traffic,
-    bus_bits,
+    GridError,
     cell_settings,
     classic_frame_bits,
-    classic_frames,
-    codes_of,
+    draw_burden,
     grid,
     measure_burden,
     observe,
@@ -38,18 +35,12 @@ from aeroloop.service.lab.burden import (
     sheets,
     traffic,
 )
-from aeroloop.service.lab.burden_figure import draw_burden
-from aeroloop.service.lab.experiment import run_experiment, sent_ticks
+from aeroloop.service.lab.experiment import experiment, heartbeat_of, run_experiment, sent_ticks
 from aeroloop.service.logs.outputs import OutputError
 from tests.support.in_this_process import run_here
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
-
-
-def test_the_front_of_a_made_up_set() -> None:
-    costs = [(1.0, 9.0), (2.0, 5.0), (2.0, 6.0), (3.0, 5.0), (4.0, 1.0), (9.0, 1.0), (4.0, 1.0)]
-    assert pareto_front(costs) == [True, True, False, False, True, False, True]
 
 
 @given(COSTS)
@@ -94,14 +85,6 @@ def test_parameters_of_one_quantizer_are_not_anothers() -> None:
         assert rate.hysteresis == (0.02 if rate.kind == "hysteresis-uniform" else None)
 
 
-def test_hysteresis_on_the_rate_leaves_the_other_signals_uniform() -> None:
-    [cell] = [c for c in grid(load(), ["8/6"], ["hysteresis-rate"], ["perfect"]) if c.quantizer]
-    wire = cell_settings(load(), cell).wire
-    assert [signal.kind for signal in (wire.attitude, wire.rate, wire.voltage)] == list(QUANTIZERS["hysteresis-rate"])
-    assert wire.rate.kind == "hysteresis-uniform"
-    assert wire.attitude.kind == wire.voltage.kind == "uniform"
-
-
 @pytest.mark.parametrize(
     ("arguments", "names"),
     [
@@ -130,7 +113,7 @@ def test_what_there_is_not_is_refused_in_one_line_before_anything_runs(
 def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
     run_here(monkeypatch)
     still = load(overrides=["reference.kind=hold"])
-    with pytest.raises(BurdenError, match=r"^float64 makes no error, sensors perfect"):
+    with pytest.raises(GridError, match=r"^float64 makes no error, sensors perfect"):
         measure_burden(still, grid(still, ["cont"], sensors=["perfect"]), 0.1)
 
 
@@ -201,67 +184,32 @@ def test_there_is_a_row_for_each_experiment_and_a_reason_for_each_without_figure
     assert not any(rows for _, rows in notes)
 
 
-def test_the_table_states_what_the_counter_costs(document: tuple[str, Path]) -> None:
-    burden = Burden.model_validate_json(document[0])
-    for bits, line in (
-        (8, "500 + 500 frames/s carry 8 kbit/s of it; 4 bits would carry 4, padding apart."),
-        (10, "500 + 500 frames/s carry 10 kbit/s of it; 4 bits would carry 4, padding apart."),
-        (4, "500 + 500 frames/s carry 4 kbit/s of it, padding apart."),
-    ):
-        notes = [note for note, _ in sheets(burden.model_copy(update={"counter_bits": bits}))]
-        assert f"The counter has {bits} bits: at every tick {line}" in notes
-
-
 # ── traffic ──
 
-NO_FRAME = b""
 KIND = FrameFormat([6, 6], 4)
 CODES = np.array([(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)], float)
 PERIOD = 0.01
 
 
-def test_every_tick_is_sent_when_periodic() -> None:
-    assert sent_ticks(CODES, "periodic", 4).tolist() == list(range(10))
-
-
-def test_on_change_sends_what_is_new_and_a_heartbeat_after_so_many_ticks() -> None:
-    assert sent_ticks(CODES, "on_change", 4).tolist() == [0, 2, 3, 7]
-    assert sent_ticks(CODES, "on_change", 7).tolist() == [0, 2, 3]
-
-
 def test_rates_are_over_all_ticks_and_intervals_between_frames_sent() -> None:
     seen = traffic(CODES, KIND, np.array([0, 2, 3, 7]), PERIOD)
-    assert seen.frames_per_s == pytest.approx(40)
-    assert seen.bits_per_s == pytest.approx(40 * 16)
-    assert seen.component_changes_per_s == pytest.approx([10, 20])  # 0→2, and 0→1→0
-    assert seen.changes_per_s == pytest.approx(30)
-    assert seen.mean_interval_ms == pytest.approx(70 / 3)
-    assert seen.least_interval_ms == pytest.approx(10)
-    assert seen.can_frames == 1
-    assert seen.can_bits_per_s == pytest.approx(40 * 75)
-    assert seen.can_load == pytest.approx(0.003)
-
-
-def test_changes_do_not_depend_on_what_was_sent() -> None:
-    always, changed = traffic(CODES, KIND, np.arange(10), PERIOD), traffic(CODES, KIND, np.array([0]), PERIOD)
-    assert always.changes_per_s == changed.changes_per_s > 0
-    assert changed.mean_interval_ms is None
-    assert changed.least_interval_ms is None
+    assert seen["frames_per_s"] == pytest.approx(40)
+    assert seen["bits_per_s"] == pytest.approx(40 * 16)
+    assert seen["component_changes_per_s"] == pytest.approx([10, 20])  # 0→2, and 0→1→0
+    assert seen["changes_per_s"] == pytest.approx(30)
+    assert seen["mean_interval_ms"] == pytest.approx(70 / 3)
+    assert seen["least_interval_ms"] == pytest.approx(10)
+    assert seen["can_frames"] == 1
+    assert seen["can_bits_per_s"] == pytest.approx(40 * 75)
+    assert seen["can_load"] == pytest.approx(0.003)
 
 
 def test_a_frame_longer_than_a_classic_one_counts_as_several() -> None:
     floats = FrameFormat([None, None], 4)
     seen = traffic(np.array([(0.0, 1.0)] * 4), floats, np.arange(4), PERIOD)
     assert floats.size == 17
-    assert seen.can_frames == 3
-    assert seen.can_bits_per_s == pytest.approx(100 * (135 + 135 + 65))
-
-
-def test_nothing_and_nonsense_are_refused() -> None:
-    with pytest.raises(ValueError, match="ticks"):
-        traffic(np.empty((0, 2)), KIND, np.arange(0), PERIOD)
-    with pytest.raises(ValueError, match="malformed"):
-        codes_of([KIND.pack(0, (1, 2)), NO_FRAME], KIND)
+    assert seen["can_frames"] == 3
+    assert seen["can_bits_per_s"] == pytest.approx(100 * (135 + 135 + 65))
 
 
 @pytest.mark.parametrize(
@@ -274,33 +222,25 @@ def test_nothing_and_nonsense_are_refused() -> None:
     ids=["uniform", "other quantizers", "float64 rates"],
 )
 def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides: tuple[str, ...]) -> None:
-    """The last bit included: frames, their ticks, figures."""
+    """The last bit included: the course, figures, ticks and sizes of frames."""
     settings = load(overrides=overrides)
-    said: list[tuple[bytes, bytes]] = []
-    run_experiment(settings, 3.0, watch=lambda _k, *frames: said.append(frames))
+    policy = {"measurement": "on_change", "command": "on_change"}
+    wire = settings.wire.model_copy(update={"transmit": settings.wire.transmit.model_copy(update=policy)})
     received: list[tuple[bytes, bytes]] = []
-    figures = run_experiment(_on_change(settings), 3.0, watch=lambda _k, *frames: received.append(frames))
-
-    seen = [dict(row) for row in observe(settings, 3.0)]
+    changed = settings.model_copy(update={"wire": wire})
+    figures = run_experiment(changed, 3.0, watch=lambda _k, *frames: received.append(frames))
+    course, seen = experiment(settings, 3.0).course, observe(settings, 3.0)
     assert [row["transmit"] for row in seen] == list(POLICIES)
     for row in seen:
         assert (row["z_track"], row["u_total"]) == (figures.z_track, figures.u_total)
-    wire = settings.wire
-    counters = wire.measurement.counters
-    heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
-    for i, (kind, measured) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
-        sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat).tolist()
-        assert [k for k, frames in enumerate(received) if frames[i] != NO_FRAME] == sent
-        assert [received[k][i] for k in sent] == [said[k][i] for k in sent]
+    for i, (codes, measured) in enumerate(
+        ((course.measured, figures.measurement), (course.commanded, figures.command))
+    ):
+        sent = sent_ticks(codes, "on_change", heartbeat_of(settings)).tolist()
+        assert [k for k, frames in enumerate(received) if frames[i]] == sent
         reckoned = seen[-1][("measurement", "command")[i]]
-        assert isinstance(reckoned, Traffic)
-        assert (reckoned.frames_per_s, reckoned.bits_per_s) == (measured.frames_per_s, measured.bits_per_s)
-        assert 0 < len(sent) < len(said)
-
-
-def _on_change(settings: Settings) -> Settings:
-    transmit = settings.wire.transmit.model_copy(update={"measurement": "on_change", "command": "on_change"})
-    return settings.model_copy(update={"wire": settings.wire.model_copy(update={"transmit": transmit})})
+        assert (reckoned["frames_per_s"], reckoned["bits_per_s"]) == (measured.frames_per_s, measured.bits_per_s)
+        assert 0 < len(sent) < len(received)
 
 
 @given(
@@ -347,16 +287,3 @@ def test_the_worst_is_nearly_reached(size: int) -> None:
     """Runs of four equal bits after a stuffed one: only the header and the CRC are not as bad as that."""
     worst = max(stuffed_length(0x078, bytes([byte]) * size) for byte in range(256))
     assert worst >= classic_frame_bits(size) - 7
-
-
-def test_what_does_not_fit_one_classic_frame_is_split_over_several() -> None:
-    assert classic_frames(7) == [7]
-    assert classic_frames(8) == [8]
-    assert classic_frames(10) == [8, 2]
-    assert classic_frames(49) == [8, 8, 8, 8, 8, 8, 1]
-    assert bus_bits(7) == 125
-    assert bus_bits(10) == 135 + 75
-    assert bus_bits(49) == 6 * 135 + 65
-    for size in (-1, 9):
-        with pytest.raises(ValueError, match="8 bytes"):
-            classic_frame_bits(size)

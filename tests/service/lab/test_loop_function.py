@@ -13,12 +13,9 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
-from aeroloop.service.figures import Figures, Floats
-from aeroloop.service.lab import experiment, loop_function
-from aeroloop.service.lab.experiment import LoopEndedError, run_experiment, sent_ticks
+from aeroloop.service.lab import loop_function
+from aeroloop.service.lab.experiment import LoopEndedError, experiment, run_experiment
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
 
 TICKS = BLOCK + 90
@@ -83,38 +80,17 @@ def configured(chosen: dict[str, Any]) -> Settings:
     return load(overrides=as_overrides(tree))
 
 
-def through(settings: Settings, ticks: int = TICKS) -> tuple[Figures, list[tuple[bytes, bytes]]]:
-    """Figures and frames of the loop through frames."""
-    frames: list[tuple[bytes, bytes]] = []
-    figures = run_experiment(settings, ticks * settings.loop.period, watch=lambda _k, *both: frames.append(both))
-    return figures, frames
-
-
-def frames_of(codes: Floats, kind: FrameFormat) -> list[bytes]:
-    """The frames of every tick from 0 on. Shape of the codes: (ticks, components)."""
-    columns = [
-        column.tolist() if width is None else column.astype(int).tolist()
-        for column, width in zip(codes.T, kind.widths, strict=True)
-    ]
-    return [kind.pack(k % kind.counters, row) for k, row in enumerate(zip(*columns, strict=True))]
-
-
 def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = TICKS) -> None:
-    """Figures, and every frame that is sent."""
-    figures, frames = through(settings, ticks)
-    course = (loop or loop_of(settings)).run(settings, ticks)
-    assert course is not None
-    wire, heartbeat = settings.wire, experiment.heartbeat_of(settings)
-    directions = (
-        (course.measured, wire.measurement, wire.transmit.measurement),
-        (course.commanded, wire.command, wire.transmit.command),
-    )
-    for (codes, kind, policy), sent in zip(directions, zip(*frames, strict=True), strict=True):
-        due = set(sent_ticks(codes, policy, heartbeat).tolist())
-        assert [frame if k in due else UNCHANGED for k, frame in enumerate(frames_of(codes, kind))] == list(sent)
-    found = experiment.experiment(settings, ticks * settings.loop.period)
-    assert found.figures == figures
-    assert found.course is not None
+    """Figures, the course, and so every frame that is sent."""
+    seconds = ticks * settings.loop.period
+    figures, course, compiled = experiment(settings, seconds, watch=lambda *_: None)
+    assert not compiled
+    found = (loop or loop_of(settings)).run(settings, ticks)
+    assert found is not None
+    for ours, theirs in zip(found, course, strict=True):
+        assert ours.tobytes() == theirs.tobytes()
+    assert experiment(settings, seconds).figures == figures
+    assert experiment(settings, seconds).compiled
 
 
 @given(CONFIGURATIONS)
@@ -192,7 +168,7 @@ def test_a_run_that_trips_ends_as_through_frames_with_its_reason(overrides: list
         run_experiment(settings, 4.0, watch=lambda *_: None)
     assert loop_of(settings).run(settings, settings.loop.ticks(4.0)) is None
     with pytest.raises(LoopEndedError) as found:
-        experiment.experiment(settings, 4.0)
+        experiment(settings, 4.0)
     assert str(found.value) == str(known.value)
 
 
@@ -205,12 +181,12 @@ def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:
     for excess, as_one_function in ((1e-12, False), (1e-6, True)):
         near = limits.model_copy(update={"max_rate": max(speeds) * (1 + excess)})
         changed = settings.model_copy(update={"plant": settings.plant.model_copy(update={"limits": near})})
-        assert (experiment.experiment(changed, 1.0).course is not None) == as_one_function
+        assert experiment(changed, 1.0).compiled == as_one_function
 
 
 def test_a_fault_runs_frame_by_frame() -> None:
     faulty = load(overrides=['plant.faults=["rate:bias=0.1@0.1"]'])
-    assert experiment.experiment(faulty, 0.3).course is None
+    assert not experiment(faulty, 0.3).compiled
     assert run_experiment(faulty, 0.3).z_track != run_experiment(load(), 0.3).z_track
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import chain
 from pathlib import Path
 
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 
 from aeroloop.service.config import Settings, load
-from aeroloop.service.lab import paper
-from aeroloop.service.lab.calibrate import TOLERANCE
-from aeroloop.service.lab.tables import Cell, Tables, baselines, predict, run_cells, sheets
-from aeroloop.service.lab.workers import open_workers, run_of
+from aeroloop.service.lab import tables as paper
+from aeroloop.service.lab.sweep import open_workers, run_of
+from aeroloop.service.lab.tables import TOLERANCE, Cell, Tables, baselines, predict, run_cells, sheets
 from tests.support.in_this_process import workers_here
 
 pytestmark = pytest.mark.processes
@@ -65,18 +63,6 @@ def test_the_fitted_cells_do_not_count_in_the_error(tables: Tables) -> None:
         abs(mine - theirs) / theirs for mine, theirs in zip(chain(*tables.C2.ours), chain(*paper.Z_TRACK), strict=True)
     ]
     assert tables.C2.mare == pytest.approx(sum(errors[:23]) / 23)
-
-
-def test_json_has_the_papers_shape_and_the_text_every_cell(tables: Tables) -> None:
-    document = json.loads(tables.model_dump_json())
-    assert set(document) == {"C2", "C3", "C4"}
-    for name, published in (("C2", paper.Z_TRACK), ("C3", paper.U_TOTAL)):
-        assert document[name]["paper"] == [list(row) for row in published]
-        assert [len(row) for row in document[name]["ours"]] == [4] * 6
-    text = str(list(sheets(tables)))
-    for row in (*paper.Z_TRACK, *paper.U_TOTAL):
-        for cell in row:
-            assert f"({cell})" in text
 
 
 def test_seeds_make_a_spread_and_the_same_seed_the_same_figures() -> None:

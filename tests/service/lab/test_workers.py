@@ -21,8 +21,7 @@ from distributed import Client, LocalCluster
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.axes import configurations, parse_axes
-from aeroloop.service.lab.sweep import Sweep, SweepPlan, run_sweep
-from aeroloop.service.lab.workers import Run, WorkersError, code_version, open_workers, run_of
+from aeroloop.service.lab.sweep import Run, Sweep, SweepError, SweepPlan, code_version, open_workers, run_of, run_sweep
 from tests.support.in_this_process import run_here, workers_here
 
 pytestmark = pytest.mark.processes
@@ -71,23 +70,16 @@ def _patience() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-def test_results_come_in_order_whatever_the_batches_and_whichever_ends_first() -> None:
+def test_results_come_in_order_whatever_the_size_of_jobs_and_whichever_ends_first() -> None:
     runs, counted = rates(*range(400, 440)), list[int]()
-    for workers in (workers_here(), workers_here(8, batch_s=100.0)):
+    for workers, first in ((workers_here(), 1), (workers_here(2, most=100), 5)):
         counted.clear()
         assert workers.rows(partial(rate_over, divisor=2), runs, counted.append) == [
             rate / 2 for rate in range(400, 440)
         ]
         assert counted == list(range(1, 41))
-    assert 16 < len(workers.batches) <= 40
-
-
-def test_batches_grow_to_what_fills_their_time() -> None:
-    workers = workers_here(batch_s=1e9)
-    workers.rows(partial(rate_over, divisor=1), rates(*range(400, 500)))
-    sizes = [count for _, count in workers.batches]
-    assert sizes[0] == sizes[-1] == 1
-    assert max(sizes) == 24  # a quarter of what is left
+        sizes = [len(job.results) for job in workers.jobs]
+        assert (max(sizes), min(sizes)) == (first, 1)  # so all workers end at about one time
 
 
 @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
@@ -117,7 +109,7 @@ def test_a_sweep_that_is_stopped_runs_only_what_is_missing_and_ends_in_the_same_
 
 
 def test_a_worker_process_that_ends_is_one_line() -> None:
-    with open_workers() as workers, pytest.raises(WorkersError, match="a worker process ended in the middle of a job"):
+    with open_workers() as workers, pytest.raises(SweepError, match="a worker process ended in the middle of a job"):
         workers.rows(end, rates(400, 500))
 
 
@@ -175,10 +167,10 @@ def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) ->
 
 
 def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
-    name = "from aeroloop.service.lab import workers as w; w.code_version ="
+    name = "from aeroloop.service.lab import sweep as w; w.code_version ="
     with Client(cluster.scheduler_address, set_as_default=False) as client:
         client.run(exec, f"{name} lambda: '0.2.0+other'", {})
-        with pytest.raises(WorkersError, match=rf"runs aeroloop 0\.2\.0\+other, this machine {code_version()[:5]}"):
+        with pytest.raises(SweepError, match=rf"runs aeroloop 0\.2\.0\+other, this machine {code_version()[:5]}"):
             swept(cluster, tmp_path / "a.parquet")
         client.run(exec, f"{name} lambda: {code_version()!r}", {})
     assert not (tmp_path / "a.parquet").exists()
@@ -189,7 +181,7 @@ def test_where_there_is_no_scheduler_or_no_worker_one_line_says_so(
 ) -> None:
     assert execute(["lab", "tables", "--engine", "dask:tcp://127.0.0.1:1"]) == 1
     assert capfd.readouterr().err.startswith("aeroloop: no Dask scheduler answers at tcp://127.0.0.1:1: ")
-    none = pytest.raises(WorkersError, match=r"no worker at tcp://.*--nthreads 1` starts one")
+    none = pytest.raises(SweepError, match=r"no worker at tcp://.*--nthreads 1` starts one")
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty, none:
         run_sweep(planned(), tmp_path / "a.parquet", engine=f"dask:{empty.scheduler_address}")
 

@@ -23,7 +23,7 @@ from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
-from aeroloop.service.logs.table import TruthColumns, columns_of, euler_deg
+from aeroloop.service.logs.table import columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
@@ -114,7 +114,7 @@ def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: 
 def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
     """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
     published = {}
-    for found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
+    for _, found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
         telemetry = Telemetry.model_validate_json(found.data)
         if telemetry.session == SESSION:
             published[telemetry.tick] = telemetry
@@ -134,25 +134,6 @@ def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Tab
     assert len(published) > 30
 
 
-def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, settings: Settings) -> None:
-    wire = settings.wire
-    assert wire.voltage.bits is not None
-    top = 2 ** (wire.voltage.bits - 1) - 1
-    codes = {}
-    recorded = Recording([log]).session((VEHICLE, SESSION)).controller
-    for k, frame in zip(recorded["tick"].tolist(), recorded["command"].tolist(), strict=True):
-        read = wire.command.unpack(frame)
-        assert read is not None
-        codes[k] = read[1]
-    for motor in (0, 1):
-        found = dict(zip(parquet["tick"], parquet[f"saturated_voltage_{motor + 2}"], strict=True))
-        assert {k: flag for k, flag in found.items() if flag is not None} == {
-            k: abs(both[motor]) == top for k, both in codes.items()
-        }
-    assert any(parquet["saturated_voltage_3"])  # the first of them are
-    assert not any(parquet["saturated_rate_x"] + parquet["saturated_attitude_x"])
-
-
 def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded() -> None:
     wire = WireSpec(actuators=3)
     top = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
@@ -164,7 +145,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
     law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
-    ticks, truth = Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros)
+    ticks, truth = Ticks(k, k, k, one, one, one, *law), np.zeros((3, 11))
     columns = columns_of((VEHICLE, SESSION), ticks, truth, load().model_copy(update={"wire": wire}))
     found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
     np.testing.assert_equal(
@@ -270,14 +251,6 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
             ticks(session)
 
 
-def test_the_table_does_not_depend_on_how_many_rows_are_written_at_a_time(
-    log: Path, tmp_path: Path, parquet: Table, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("aeroloop.service.logs.export.AT_A_TIME", 64)
-    export([log], "parquet", tmp_path / "64.parquet")
-    assert pyarrow.parquet.read_table(tmp_path / "64.parquet").to_pydict() == parquet
-
-
 def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behind(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -325,14 +298,3 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
         out = Path(result["out"])
         assert (out, result["bytes"]) == (log.with_name(name), out.stat().st_size)
         out.unlink()
-
-
-@pytest.mark.parametrize(("actuators", "numbers"), [(1, "1"), (2, "23"), (3, "123"), (8, "12345678")])
-def test_the_table_has_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
-    settings = load().model_copy(update={"wire": WireSpec(actuators=actuators)})
-    one, volts, q = np.ones(1), np.ones((1, actuators)), np.ones((1, 4))
-    law = q, q, q[:, :3], q[:, :3], q[:, :3], volts, volts, np.ones((1, 9)), q, q
-    k = np.arange(1)
-    ticks, truth = Ticks(k, k, k, one, one, one, *law), TruthColumns(one, q, q[:, :3], volts)
-    names = {column.name for column in columns_of((VEHICLE, SESSION), ticks, truth, settings)}
-    assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import random
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import SessionRecord
@@ -14,7 +16,6 @@ from aeroloop.protocol.messages.trace import RECORD_S, Tail, TraceWriter, read_b
 from aeroloop.service.config import load
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.in_force import InForce, Segment
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import read
 from tests.support.made_log import SESSION, VEHICLE, Changes, Logged, lockstep, made, write
@@ -98,20 +99,31 @@ def test_what_was_in_force_before_the_first_change_that_a_late_log_has_is_unknow
     assert f"ticks {unknown.first_tick} to {unknown.last_tick} of s1 are left out" in str(unknown)
 
 
-def test_a_change_within_a_gap_is_left_out_with_the_ticks_before_it(
-    whole: tuple[list[Logged], str], tmp_path: Path
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_batches_are_lost_no_tick_is_computed_otherwise(
+    whole: tuple[list[Logged], str], tmp_path: Path, seed: int
 ) -> None:
-    messages, transmit = whole
+    """Every recorded tick is computed as of the whole log, or named: as unknown, or among rows that are missing."""
+    (messages, transmit), rng = whole, random.Random(seed)
     truth = read(written(tmp_path / "whole.mcap", messages, transmit)).ticks
-    log = written(tmp_path / "a.mcap", without(messages, 60, 400, "controller"), transmit)
-    known = read(log).ticks
-    (unknown,) = read(log).findings.unknown
-    assert 60 <= unknown.first_tick < 120
-    assert unknown.last_tick == 199  # the record says that both are in force since tick 200
-    left = truth.where((truth.k < unknown.first_tick) | (truth.k > unknown.last_tick))
-    assert (known.k == left.k).all()
-    assert (known.desired == left.desired).all()
-    assert replay([log]).controller is not None
+    for first in (rng.randrange(0, TICKS, 50) for _ in range(3)):
+        messages = without(messages, first, first + rng.randrange(40, 500), rng.choice(["controller", "plant", None]))
+    log = written(tmp_path / "a.mcap", messages, transmit)
+    known, findings = read(log).ticks, read(log).findings
+    its = truth.where(np.isin(truth.k, known.k))
+    assert (known.k == its.k).all()
+    assert (known.desired == its.desired).all()
+    for name in COLUMNS:
+        found = getattr(known, name)
+        same = (found == getattr(its, name)) | np.isnan(found)
+        assert same.all(), (name, known.k[~same.all(axis=1)])
+    batches = [found for message in messages if (found := ends_of(message)) is not None]
+    recorded = {k for _, first, last in batches for k in range(first, last + 1)}
+    spans = [(one.first_tick, one.last_tick) for one in findings.unknown]
+    spans += [(one.first_tick, one.last_tick) for one in findings.missing if one.last_tick is not None]
+    named = {k for first, last in spans for k in range(first, last + 1)}
+    answered = range(int(known.k[-1]) + 1)
+    assert recorded & set(answered) <= set(known.k.tolist()) | named
     assert not replay([log]).differs
 
 
@@ -168,35 +180,3 @@ def test_a_sessions_record_says_what_is_in_force_as_its_changes_do() -> None:
     assert record.in_force == in_force(changes)
     assert Tail.model_validate_json(b'{"record":' + record_json(record.in_force) + b"}").record == in_force(changes)
     assert record.model_copy(update={"reference": Stream()}).in_force == []
-
-
-@pytest.mark.parametrize(
-    ("records", "segments", "until", "unknown"),
-    [
-        ([], [([0, 50], 99)], 99, [(0, 99)]),
-        ([(0, 60)], [([0, 50], 99)], 99, []),
-        ([(30, 160)], [([100, 150], 199)], 199, [(0, 29)]),
-        ([(120, 160)], [([100, 150], 199)], 199, [(0, 149)]),
-        ([(0, 40), (70, 160)], [([0], 49), ([100, 150], 199)], 199, [(50, 69)]),
-        ([(0, 40), (20, 160)], [([0], 49), ([100, 150], 199)], 199, []),
-        ([(0, 40)], [([0], 49), ([100, 150], 199)], 199, [(50, 199)]),
-        ([(0, 40), (10, 75)], [([0], 49)], 80, [(76, 80)]),
-        ([(10, 75)], [], 80, [(0, 9), (76, 80)]),
-    ],
-)
-def test_ticks_are_known_from_since_when_a_record_says_to_the_next_gap(
-    records: list[tuple[int, int]],
-    segments: list[tuple[list[int], int]],
-    until: int,
-    unknown: list[tuple[int, int]],
-) -> None:
-    """Records as (since, tick of its batch); segments as (first ticks of the batches, last tick)."""
-    found = InForce()
-    for since, tick in records:
-        writer = TraceWriter("controller", load().wire, 1, 1)
-        writer.session = "s"
-        writer.record = record_json([Change(session="s", tick=since, gains=Gains(C1=(0.3,) * 3), reference=LEVEL)])
-        batch = read_batch(writer.take(10**9, 0))
-        assert batch is not None
-        found.add(batch.header, batch.tail, tick)
-    assert found.unknown([Segment(begins, last) for begins, last in segments], (0, until)) == unknown

@@ -11,7 +11,6 @@ import random
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +24,6 @@ from aeroloop.service.logs.export import export
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.logs.recover import RecoverError, recover
 from aeroloop.service.recording import rolling
-from aeroloop.service.review.review import review
 from aeroloop.service.settings import RecorderSettings
 from tests.support.made_log import make_log
 from tests.support.mcap_parts import with_a_damaged_chunk
@@ -111,22 +109,6 @@ def assert_all_read(reader: Reader, *paths: Path) -> None:
 def test_a_recorded_log(reader: Reader, whole: Path) -> None:
     assert_all_read(reader, whole)
     assert ours(whole)["aeroloop/aero/telemetry"].messages == TICKS // 10
-
-
-def test_the_log_of_a_real_run(reader: Reader, tmp_path: Path) -> None:
-    """Three processes over Zenoh, in lockstep, so it takes as long as it takes and nothing is late."""
-    log = tmp_path / "demo.mcap"
-    command = ["demo", "--lockstep", "--duration", "1", "--json", "--log", str(log)]
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "aeroloop", *command],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    assert_all_read(reader, log)
-    assert review(log).duration_s == json.loads(done.stdout)["duration_s"]
 
 
 def test_the_files_of_a_rotated_run(reader: Reader, whole: Path, tmp_path: Path) -> None:

@@ -13,23 +13,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-import lz4.frame
 import pytest
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message
+from mcap.records import Channel, Chunk, Message
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from mcap.writer import CompressionType, Writer
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs import mcap_file
 from aeroloop.service.logs.mcap_file import (
     DESCRIPTION_METADATA,
     MAX_CHUNK,
-    MAX_RECORD,
     Damage,
     messages,
     opening,
@@ -49,18 +45,15 @@ TICKS: Final = 600
 
 
 def read(path: Path, damages: list[Damage]) -> list[Read]:
-    """Every message, which `records` and `messages` must agree on, and on what is damaged."""
-    found, by_topic = [], list[Damage]()
+    """Every message."""
     channels: dict[int, str] = {}
+    found = []
     for record in records(path, damages):
         if isinstance(record, Channel):
             channels[record.id] = record.topic
         elif isinstance(record, Message):
             topic = channels[record.channel_id]
             found.append(Read(topic, record.sequence, record.log_time, record.publish_time, record.data))
-    logged = messages(path, lambda channel: channel.topic, by_topic)
-    assert [Read(one.answer, one.sequence, one.log_time, one.publish_time, one.data) for one in logged] == found
-    assert by_topic == damages
     return found
 
 
@@ -86,7 +79,7 @@ def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
     assert read(whole, damages) == everything
     assert damages == []
     named = messages(whole, lambda channel: channel.topic.endswith("/telemetry") or None)
-    assert [one.data for one in named] == [one.data for one in everything if one.topic.endswith("/telemetry")]
+    assert [one.data for _, one in named] == [one.data for one in everything if one.topic.endswith("/telemetry")]
     assert recover(whole, tmp_path / "out.mcap").lost == []
     assert by_mcap(tmp_path / "out.mcap") == everything
     assert Recording([tmp_path / "out.mcap"]).descriptions == Recording([whole]).descriptions
@@ -101,7 +94,7 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut_and_says_up_
     data_end = next(part.end for part in parts(data[: -len(MAGIC)], len(MAGIC)) if part.opcode == Opcode.DATA_END)
     of_chunk = len(everything) / len(ends)
     edges = (place + d for place in (*ends, data_end) for d in (-1, 0, 1))
-    for size in {*(rng.randrange(8, len(data)) for _ in range(100)), *edges}:
+    for size in {*(rng.randrange(8, len(data)) for _ in range(60)), *edges}:
         cut.write_bytes(data[:size])
         damages: list[Damage] = []
         got = read(cut, damages)
@@ -128,7 +121,7 @@ def test_a_flipped_bit_anywhere_costs_one_chunk_at_most_and_nothing_unnamed(
     log = parts(data[: -len(MAGIC)], len(MAGIC))
     in_heads = [part.offset * 8 + rng.randrange(HEAD.size * 8) for part in log for _ in range(2)]
     of_chunk = len(everything) / len(chunks(data))
-    for bit in (*in_heads, *(rng.randrange(len(MAGIC) * 8, len(data) * 8) for _ in range(100))):
+    for bit in (*in_heads, *(rng.randrange(len(MAGIC) * 8, len(data) * 8) for _ in range(60))):
         bent = bytearray(data)
         bent[bit // 8] ^= 1 << bit % 8
         flipped.write_bytes(bent)
@@ -142,27 +135,25 @@ def test_a_flipped_bit_anywhere_costs_one_chunk_at_most_and_nothing_unnamed(
         assert got == everything[:start] + everything[start + lost :]  # the rest, in one piece on either side
 
 
-def test_a_log_of_a_killed_recorder_is_read_where_records_are_whole(whole: Path, tmp_path: Path) -> None:
-    """Without an index, the first chunk alone describes its channels: their messages are named as lost, once."""
+def test_a_log_of_a_killed_recorder_is_read_up_to_the_damage(
+    whole: Path, everything: list[Read], tmp_path: Path
+) -> None:
     data = bytearray(whole.read_bytes()[:-END])
-    first, second = chunks(whole.read_bytes())[:2]
-    data[(second.offset + second.end) // 2] ^= 0x10
+    damaged = chunks(whole.read_bytes())[5]
+    data[(damaged.offset + damaged.end) // 2] ^= 0x10
     killed, damages = tmp_path / "killed.mcap", list[Damage]()
     killed.write_bytes(data)
-    assert len(read(killed, damages)) > 0.8 * len(read(whole, []))
-    assert damages[0].offset == second.offset
-    data[(first.offset + first.end) // 2] ^= 0x10
-    killed.write_bytes(data)
-    damages = []
-    assert read(killed, damages) == []
-    undescribed = [damage for damage in damages if "describes" in damage.what]
-    assert len(undescribed) == len({damage.what for damage in undescribed}) == 3
+    got = read(killed, damages)
+    assert got == everything[: len(got)] != []
+    assert [damage.offset for damage in damages] == [damaged.offset]
+    assert damages[0].after_ns == max(one.log_time for one in got)
+    assert recover(killed, tmp_path / "out.mcap").lost == list(map(str, damages))
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(seed: int, tmp_path: Path) -> None:
     """50 files each: cut, or with up to three bits flipped, some of them without their index."""
-    log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261123 + seed)
+    log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261201 + seed)
     make_log(log, 200, changes={120: AN_OPERATORS_WORDS[120]}, chunk_every=4, truth_every=20)
     data, clean, same = log.read_bytes(), read_run(log), replay([log])
     refused: list[str] = []
@@ -214,21 +205,6 @@ def test_what_a_full_disk_cut_short_is_removed(whole: Path, tmp_path: Path) -> N
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not (tmp_path / "out.mcap").exists()
-
-
-def test_an_attachment_with_a_flipped_bit_is_left_out_and_named(tmp_path: Path) -> None:
-    path, damages = tmp_path / "a.mcap", list[Damage]()
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for name in ("a", "b"):
-            writer.add_attachment(0, 0, name, "", b"content")
-        writer.finish()
-    data = bytearray(path.read_bytes())
-    data[data.index(b"content")] ^= 0x01
-    path.write_bytes(data)
-    assert [record.name for record in records(path, damages) if isinstance(record, Attachment)] == ["b"]
-    assert len(damages) == 1
 
 
 # Descriptions
@@ -302,32 +278,14 @@ def _unsized(data: bytes) -> bytes:
 BOMB: Final = bytes(2 * MAX_CHUNK)
 LIES: Final[dict[str, Callable[[], bytes]]] = {
     "a record of 2^62 bytes": lambda: HEAD.pack(Opcode.METADATA, 1 << 62),
-    "a record that is too long": lambda: HEAD.pack(Opcode.CHUNK, MAX_RECORD + 1) + bytes(100),
-    "a record that is longer than the file": lambda: HEAD.pack(Opcode.CHUNK, MAX_RECORD) + bytes(100),
-    "a chunk with 2^63 bytes of data": lambda: _lying_length(),
+    "a record that is longer than the file": lambda: HEAD.pack(Opcode.CHUNK, MAX_CHUNK) + bytes(100),
+    "a chunk with 2^63 bytes of data": lambda: chunk_of(b"", 0)[:-8] + struct.pack("<Q", 1 << 63),
     "a chunk that claims too much": lambda: chunk_of(_unsized(bytes(100)), MAX_CHUNK + 1),
     "a frame that claims more than its chunk": lambda: chunk_of(zstandard.compress(BOMB), 1000),
     "a bomb of zstd": lambda: chunk_of(_unsized(BOMB), 1000),
-    "a bomb of lz4": lambda: chunk_of(lz4.frame.compress(BOMB), 1000, "lz4"),
-    "a chunk with less than it claims": lambda: chunk_of(_unsized(bytes(100)), MAX_CHUNK),
-    "a chunk that is not compressed, with less": lambda: chunk_of(bytes(99), 1000, ""),
     "an unknown compression": lambda: chunk_of(bytes(100), 100, "rar"),
-    "a message in a chunk that is longer than it": lambda: _cut_message(),
     "a message in a chunk that is too short": lambda: chunk_of(HEAD.pack(Opcode.MESSAGE, 2) + bytes(2), 11, ""),
 }
-
-
-def _cut_message() -> bytes:
-    builder = RecordBuilder()
-    Channel(1, "a", "", {}, 0).write(builder)
-    data = bytes(builder.end()) + HEAD.pack(Opcode.MESSAGE, 100) + struct.pack("<HIQQ", 1, 2, 3, 4)
-    return chunk_of(data, len(data), "")
-
-
-def _lying_length() -> bytes:
-    chunk = bytearray(chunk_of(b"", 0))
-    chunk[-8:] = struct.pack("<Q", 1 << 63)
-    return bytes(chunk)
 
 
 @pytest.mark.parametrize("lie", LIES)
@@ -336,65 +294,12 @@ def test_what_a_file_claims_costs_no_memory_and_is_damage(tmp_path: Path, whole:
     first = chunks(whole.read_bytes())[0].offset
     block = LIES[lie]()
     path.write_bytes(whole.read_bytes()[:first] + block)
-    if lie == "a record that is too long":
-        os.truncate(path, 2 * MAX_RECORD)  # as long as it says, on a disk that keeps no zeros
     tracemalloc.start()
     assert read(path, damages) == []
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert damages[0].offset == first
-    held = MAX_CHUNK if "less than it claims" in lie else 0  # as much as a chunk may hold is given it
-    assert peak < held + 10 * len(block) + 1_000_000
-
-
-def _messages(size: int) -> bytes:
-    """A channel and as many empty messages."""
-    builder = RecordBuilder()
-    Channel(1, "a", "", {}, 0).write(builder)
-    message = HEAD.pack(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 0, 0)
-    head = bytes(builder.end())
-    return head + message * ((size - len(head)) // len(message))
-
-
-BOMBS: Final[dict[str, bytes]] = {
-    "zeros": bytes(MAX_CHUNK),
-    "messages": _messages(1 << 20),
-    "records without a kind": HEAD.pack(0, 0) * 100_000,
-    "records that cannot be read": HEAD.pack(Opcode.CHANNEL, 0) * 100_000,
-}
-
-
-@pytest.mark.parametrize("kind", BOMBS)
-def test_a_small_file_of_bombs_costs_bounded_memory_and_a_bounded_number_of_messages(
-    tmp_path: Path, whole: Path, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mcap_file, "DENSE_BYTES", 4 << 20)
-    content = BOMBS[kind]
-    first = chunks(whole.read_bytes())[0].offset
-    path, damages = tmp_path / "bombs.mcap", list[Damage]()
-    path.write_bytes(whole.read_bytes()[:first] + chunk_of(zstandard.compress(content), len(content)) * 200)
-    assert path.stat().st_size < 1_000_000
-    tracemalloc.start()
-    count = sum(isinstance(record, Message) for record in records(path, damages))
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert count <= (4 << 20) / 31
-    assert peak < 8 * (1 << 20)
-    assert 190 <= len(damages) <= 201
-
-
-@pytest.mark.parametrize("compression", CompressionType)
-def test_every_compression_is_read(tmp_path: Path, compression: CompressionType) -> None:
-    path, damages = tmp_path / "a.mcap", list[Damage]()
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1000, compression=compression)
-        writer.start()
-        channel = writer.register_channel("a", "", 0)
-        for i in range(100):
-            writer.add_message(channel, i, bytes(i), 2 * i, 3 * i)
-        writer.finish()
-    assert read(path, damages) == [Read("a", 3 * i, i, 2 * i, bytes(i)) for i in range(100)]
-    assert damages == []
+    assert peak < 10 * len(block) + 1_000_000
 
 
 # The index
@@ -405,49 +310,33 @@ def with_index(data: bytes, edit: Callable[[list[Part]], list[Part]]) -> bytes:
     start, offsets, _ = FOOTER.unpack_from(data, len(data) - END + HEAD.size)
     index = b"".join(part.bytes for part in edit(parts(data[start:-END])))
     footer = data[-END : -END + HEAD.size] + struct.pack("<QQ", start, offsets)
-    checksum = zlib.crc32(index + footer)
-    return data[:start] + index + footer + struct.pack("<I", checksum) + data[-len(MAGIC) :]
+    return data[:start] + index + footer + struct.pack("<I", zlib.crc32(index + footer)) + data[-len(MAGIC) :]
 
 
-def _elsewhere(index: list[Part], opcode: int, at: int) -> list[Part]:
-    """The last entry of a kind points at the file's header."""
-    last = max(i for i, part in enumerate(index) if part.opcode == opcode)
-    content = bytearray(index[last].content)
-    struct.pack_into("<Q", content, at, len(MAGIC))
-    return [*index[:last], index[last]._replace(content=bytes(content)), *index[last + 1 :]]
-
-
-def _without(index: list[Part], opcode: int) -> list[Part]:
-    last = max(i for i, part in enumerate(index) if part.opcode == opcode)
+def without_a_chunk(index: list[Part]) -> list[Part]:
+    last = max(i for i, part in enumerate(index) if part.opcode == Opcode.CHUNK_INDEX)
     return [*index[:last], *index[last + 1 :]]
 
 
-WRONG: Final[dict[str, Callable[[list[Part]], list[Part]]]] = {
-    "a chunk is not in it": lambda index: _without(index, Opcode.CHUNK_INDEX),
-    "a chunk is elsewhere": lambda index: _elsewhere(index, Opcode.CHUNK_INDEX, 16),
-    "metadata is not in it": lambda index: _without(index, Opcode.METADATA_INDEX),
-    "metadata is elsewhere": lambda index: _elsewhere(index, Opcode.METADATA_INDEX, 0),
-    "a channel is not in it": lambda index: _without(index, Opcode.CHANNEL),
-    "a record of it is cut": lambda index: [*index[:-1], index[-1]._replace(content=b"")],
-}
+def with_a_chunk_elsewhere(index: list[Part]) -> list[Part]:
+    """The last chunk is said to begin where the file's header does."""
+    last = max(i for i, part in enumerate(index) if part.opcode == Opcode.CHUNK_INDEX)
+    content = bytearray(index[last].content)
+    struct.pack_into("<Q", content, 16, len(MAGIC))
+    return [*index[:last], index[last]._replace(content=bytes(content)), *index[last + 1 :]]
 
 
-@pytest.mark.parametrize("wrong", WRONG)
 def test_an_index_that_is_wrong_costs_at_most_what_it_points_away_from(
-    whole: Path, everything: list[Read], tmp_path: Path, wrong: str
+    whole: Path, everything: list[Read], tmp_path: Path
 ) -> None:
     """Its checksum fits: only what it says of the file does not."""
-    path, damages = tmp_path / "wrong.mcap", list[Damage]()
-    data = whole.read_bytes()
-    assert with_index(data, lambda index: index) == data
-    path.write_bytes(with_index(data, WRONG[wrong]))
-    got = read(path, damages)
-    if "elsewhere" in wrong:
-        assert len(got) > len(everything) * (1 - 1.5 / len(chunks(data)))
-        assert [damage.offset for damage in damages] == [len(MAGIC)]
-    else:
-        assert (got, damages) == (everything, [])
-        assert Recording([path]).descriptions == Recording([whole]).descriptions
+    path, data = tmp_path / "wrong.mcap", whole.read_bytes()
+    found = list[Damage]()
+    path.write_bytes(with_index(data, without_a_chunk))
+    assert (read(path, found), found) == (everything, [])
+    path.write_bytes(with_index(data, with_a_chunk_elsewhere))
+    assert len(read(path, found)) > len(everything) * (1 - 1.5 / len(chunks(data)))
+    assert [damage.offset for damage in found] == [len(MAGIC)]
 
 
 def test_an_index_of_which_a_bit_flipped_is_not_used_and_costs_nothing(
@@ -460,8 +349,7 @@ def test_an_index_of_which_a_bit_flipped_is_not_used_and_costs_nothing(
         bent[bit // 8] ^= 1 << bit % 8
         path.write_bytes(bent)
         damages: list[Damage] = []
-        assert read(path, damages) == everything
-        assert damages == []
+        assert (read(path, damages), damages) == (everything, [])
 
 
 def test_the_record_behind_the_header_opens_the_file(whole: Path, tmp_path: Path) -> None:

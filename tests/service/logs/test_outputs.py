@@ -24,35 +24,32 @@ VERBS: Final[dict[str, tuple[str, ...]]] = {
 """Every verb that writes a file that the user names."""
 
 
-def _link(path: Path) -> str:
+def _symbolic_link(path: Path) -> str:
     path.with_name("link.png").symlink_to(path)
     return "link.png"
 
 
-def _second_name(path: Path) -> str:
+def _hard_link(path: Path) -> str:
     os.link(path, path.with_name("second.png"))
     return "second.png"
 
 
-def _renamed(path: Path) -> str:
+def _another_ending(path: Path) -> str:
     path.with_name("renamed.png").write_bytes(path.read_bytes())
     return "renamed.png"
 
 
-def _headless(path: Path) -> str:
+def _a_log_whose_head_is_lost(path: Path) -> str:
     path.with_name("other.mcap").write_bytes(b"")
     path.with_name("other.png").symlink_to("other.mcap")
     return "other.png"
 
 
-LOGS: Final[dict[str, Callable[[Path], str]]] = {
-    "by a relative path": lambda path: f"../{path.parent.name}/{path.name}",
-    "by its full path": str,
-    "by a symbolic link": _link,
-    "by a hard link": _second_name,
-    "a log of another ending": _renamed,
-    "a log whose head is lost": _headless,
-}
+def _relative_path(path: Path) -> str:
+    return f"../{path.parent.name}/{path.name}"
+
+
+NAMES: Final = (str, _relative_path, _symbolic_link, _hard_link, _another_ending, _a_log_whose_head_is_lost)
 """Names of a log as an output."""
 
 
@@ -77,12 +74,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("named", NAMES)
 @pytest.mark.parametrize("verb", VERBS)
 def test_no_verb_overwrites_a_log_by_any_name_and_not_with_force(
-    here: Path, verb: str, name: str, capfd: pytest.CaptureFixture[str]
+    here: Path, verb: str, named: Callable[[Path], str], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    out = LOGS[name](here / "a.mcap")
+    out = named(here / "a.mcap")
     before = contents(here)
     for force in ((), ("--force",)):
         assert execute([out if word == "OUT" else word for word in VERBS[verb]] + [*force]) in (1, 2)

@@ -95,7 +95,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
     at = {k: i for i, k in enumerate(ticks.k.tolist())}
     published = 0
-    for found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
+    for _, found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
         telemetry = Telemetry.model_validate_json(found.data)
         i = at[telemetry.tick]
         assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
@@ -110,7 +110,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     ("kind", "wire"),
     [
         *((kind, wire) for kind in ("adaptive", EXPRESSIONS, PYTHON) for wire in WIRES),
-        *((f"{HERE}:{name}", "default") for name in ("Bare", "BarePython")),
+        *((kind, "default") for kind in ("adaptive-torque", f"{HERE}:Bare", f"{HERE}:BarePython")),
     ],
 )
 def test_a_log_of_any_law_and_wire_is_computed_again_as_it_was(kind: str, wire: str, tmp_path: Path) -> None:

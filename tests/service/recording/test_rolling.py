@@ -1,195 +1,379 @@
-"""Rotated run: every message once, every file readable alone, the oldest deleted, none overwritten."""
+"""Rolling log: every message stands in a file that can be read alone, whatever disk and folder do meanwhile."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import random
 import re
-from itertools import pairwise
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from aeroloop.service.logs.mcap_file import (
-    CHUNK_BYTES,
-    DESCRIPTION_METADATA,
-    RECORDER_METADATA,
-    records,
-    with_checksum,
+from aeroloop.protocol.transport.history import Delivery
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, Damage, records, with_checksum
+from aeroloop.service.logs.recover import recover
+from aeroloop.service.recording import rolling
+from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
+from aeroloop.service.settings import RecorderSettings
+from aeroloop.service.viewers.schemas import Decoded, Shape
+
+KEY, DESCRIPTION = "aeroloop/aero/telemetry", "aeroloop/aero/description/plant"
+START_NS = 1_800_000_000_000_000_000
+HEAD = Path("protocol/SPEC.md").stat().st_size + 1000
+"""Bytes at a file's beginning, about."""
+SHAPE = Shape("x", "jsonschema", b"{}", "json")
+EVERYTHING = 1 << 60
+
+
+class Disk:
+    """Where files are written: `room` bytes for each, `at_once` per call.
+
+    Every call gives `error`, the first into a file `at_heads`; 0 is none.
+    """
+
+    def __init__(self) -> None:
+        self.room = self.at_once = EVERYTHING
+        self.error = self.at_heads = self.calls = 0
+        self._write = os.pwrite
+
+    def write(self, fd: int, data: memoryview, offset: int) -> int:
+        self.calls += 1
+        size = min(len(data), self.at_once, self.room - offset)
+        if error := self.error or (self.at_heads if not offset else 0) or (errno.ENOSPC if size <= 0 else 0):
+            raise OSError(error, os.strerror(error))
+        return self._write(fd, data[:size], offset)
+
+
+@pytest.fixture
+def disk() -> Iterator[Disk]:
+    disk = Disk()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "pwrite", disk.write)
+        patch.setattr(os, "fdatasync", lambda _: None)
+        yield disk
+
+
+class Run:
+    """A log that is fed as the recorder does: a message of 200 bytes a millisecond; what the disk refuses waits."""
+
+    def __init__(self, path: Path, **options: object) -> None:
+        self.now, self.count, self.reported = 1000.0, 0, list[tuple[str, bool]]()
+        self.waiting: list[int] = []
+        settings = RecorderSettings.model_validate({"path": path, "chunk_s": 0.05, **options})
+        self.log = RollingLog(settings, lambda *reported: self.reported.append(reported), lambda: self.now)
+        self.log.add_description(DESCRIPTION, b'{"a":1}')
+
+    def take(self, count: int) -> None:
+        for _ in range(count):
+            self.waiting.append(self.count)
+            self.count += 1
+            self.wait(0.001)
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+        self.log.tend()
+        while self.waiting and not self.log.trouble:
+            number = self.waiting.pop(0)
+            at_ns = START_NS + number * 1_000_000
+            decoded = [Decoded("/aero/x", SHAPE, b"{}", at_ns)]
+            self.log.add(Delivery(KEY, payload(number), number, at_ns, 1), at_ns + 77, decoded)
+
+    def faults(self) -> list[str]:
+        return [text for text, bad in self.reported if bad]
+
+
+def payload(number: int) -> bytes:
+    """Does not compress."""
+    return random.Random(number).randbytes(200)
+
+
+def numbers(path: Path, damages: list[Damage] | None = None) -> list[int]:
+    """Of the messages in a file, also in one without index, all as they were given."""
+    read = list(records(path, damages))
+    ours = {one.id for one in read if isinstance(one, Channel) and one.topic == KEY}
+    found = [one for one in read if isinstance(one, Message) and one.channel_id in ours]
+    for one in found:
+        at_ns = START_NS + one.sequence * 1_000_000
+        assert (one.data, one.publish_time, one.log_time) == (payload(one.sequence), at_ns, at_ns + 77)
+    return [one.sequence for one in found]
+
+
+def indexed(path: Path) -> tuple[int, int]:
+    """How many messages, raw and decoded, mcap's own reader finds by the index; checksums checked."""
+    with path.open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages()]
+    return topics.count(KEY), topics.count("/aero/x")
+
+
+STEPS = st.tuples(
+    st.sampled_from(["take", "wait", "full", "broken", "slow", "mend", "move", "remove"]), st.integers(1, 150)
 )
-from aeroloop.service.recording.rolling import RecorderError
-from tests.support.made_recording import (
-    TICK_S,
-    Arrived,
-    Clock,
-    Disk,
-    EventLog,
-    Recording,
-    every_message,
-    in_order,
-    numbered,
-    raw,
-)
-
-LARGE = Path("protocol/SPEC.md").stat().st_size + 15_000
-"""Bytes of a file: what stands at its head, and some chunks."""
-
-TIMED = re.compile(r"aeroloop-\d{8}-\d{6}(-\d{4})?\.mcap")
 
 
-@pytest.mark.parametrize("settings", [{"max_file_mb": LARGE / 1e6}, {"max_file_s": 0.4}], ids=["by size", "by time"])
-def test_over_all_files_every_message_stands_once_and_each_file_can_be_read_alone(
-    settings: dict[str, float], tmp_path: Path, story: EventLog, clock: Clock
+@settings(max_examples=60, deadline=None)
+@given(steps=st.lists(STEPS, max_size=25), max_file_s=st.sampled_from([0.2, 3600.0]))
+def test_whatever_happens_to_disk_and_files_every_message_is_recorded_and_every_closed_file_is_whole(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int]], max_file_s: float
 ) -> None:
-    """No file is larger or older than configured by more than a chunk."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1, **settings)
-    recording.take(story.messages)
-    recording.log.close()
-    assert recording.reported == []
-    files, identities = in_order(tmp_path), set()
-    assert len(files) >= 3
+    folder, aside = tmp_path_factory.mktemp("log"), tmp_path_factory.mktemp("aside")
+    with pytest.MonkeyPatch.context() as patch:
+        disk = Disk()
+        patch.setattr(os, "pwrite", disk.write)
+        run = Run(folder / "a.mcap", max_file_s=max_file_s)
+        for i, (step, n) in enumerate(steps):
+            size = run.log.path.stat().st_size if run.log.path.exists() else 0
+            match step:
+                case "take":
+                    run.take(n)
+                case "wait":
+                    run.wait(n / 50)
+                case "full":
+                    disk.room = size + 100 * n
+                case "broken":
+                    disk.error = errno.EIO
+                case "slow":
+                    disk.at_once = 100 * n
+                case "mend":
+                    disk.room, disk.error = EVERYTHING, 0
+                case "move" if run.log.path.exists():
+                    run.log.path.rename(aside / f"{i}.moved")
+                case "remove" if run.log.path.exists():  # what is on the disk goes with it
+                    shutil.copy(run.log.path, aside / f"{i}.removed")
+                    run.log.path.unlink()
+        disk.room, disk.at_once, disk.error = EVERYTHING, EVERYTHING, 0
+        run.wait(rolling.RETRY_S)
+        run.take(1)
+        run.log.close(len(run.waiting))
+    files = [*folder.iterdir(), *aside.iterdir()]
+    assert {number for path in files for number in numbers(path)} == set(range(run.count))
+    assert run.log.written == run.count
+    said = " ".join(run.faults())
+    for path in files:
+        found = numbers(path)
+        assert found == sorted(set(found))
+        if path.suffix == ".mcap" and f"the index of {path}" not in said:
+            assert indexed(path) == (len(found), len(found))
+
+
+@pytest.mark.parametrize("room", range(HEAD, HEAD + 30_000, 2713))
+def test_on_a_disk_that_was_full_all_goes_on_in_one_whole_file(tmp_path: Path, disk: Disk, room: int) -> None:
+    """Wherever it was full: within a chunk's head, its data, the index. Nothing half stays behind meanwhile."""
+    run, path = Run(tmp_path / "a.mcap"), tmp_path / "a.mcap"
+    disk.room = room
+    run.take(120)
+    damages: list[Damage] = []
+    assert numbers(path, damages) == list(range(120 - len(run.waiting)))[: len(numbers(path))]
+    assert [damage.what for damage in damages] == ["the file ends here, without its index"]
+    disk.room = EVERYTHING
+    run.log.tend(at_once=True)  # as a recorder that is stopped does
+    run.wait(0.0)
+    run.log.close(len(run.waiting))
+    assert numbers(path) == list(range(120))
+    assert indexed(path) == (120, 120)
+    assert list(tmp_path.iterdir()) == [path]
+    if run.reported:
+        (refused, again), why = run.reported, os.strerror(errno.ENOSPC)
+        assert refused == (
+            f"{path} cannot be written: {why}; messages are kept in memory and written when it can be", True
+        )  # fmt: skip
+        assert again == (f"recording again to {path}", False)
+
+
+def test_a_fault_that_lasts_is_tried_every_second_and_reported_every_minute(tmp_path: Path, disk: Disk) -> None:
+    run = Run(tmp_path / "a.mcap")
+    disk.room, before = 0, disk.calls
+    run.take(100)
+    for _ in range(600):
+        run.wait(0.1)
+    assert 55 <= disk.calls - before <= 62
+    assert len(run.faults()) == 1
+    for _ in range(10):
+        run.wait(0.1)
+    assert len(run.faults()) == 2
+    assert str(tmp_path / "a.mcap") in run.log.trouble
+    disk.room = EVERYTHING
+    run.wait(1.0)
+    run.log.close()
+
+
+def test_a_moved_file_and_a_missing_folder_are_reported_and_the_moved_file_is_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    run = Run(folder / "a.mcap")
+    run.take(100)
+    (folder / "a.mcap").rename(tmp_path / "moved")
+    run.wait(1.0)
+    assert run.faults() == [f"{folder / 'a.mcap'} was moved or removed while it was written"]
+    assert indexed(tmp_path / "moved") == (100, 100)
+    shutil.rmtree(folder)
+    run.take(100)
+    assert run.log.trouble == f"{folder / 'a-0001.mcap'} cannot be written: {os.strerror(errno.ENOENT)}"
+    folder.mkdir()
+    run.wait(rolling.RETRY_S)
+    assert run.reported[-1] == (f"recording again to {folder / 'a-0002.mcap'}", False)
+    run.log.close()
+    assert numbers(folder / "a-0002.mcap")[-100:] == list(range(100, 200))
+
+
+def test_a_file_that_is_removed_to_make_room_gives_its_room_back_and_one_that_is_removed_at_last_costs_nothing(
+    tmp_path: Path, disk: Disk
+) -> None:
+    run = Run(tmp_path / "a.mcap", chunk_s=1.0)
+    disk.room = 0
+    run.take(100)
+    run.wait(1.0)
+    (tmp_path / "a.mcap").unlink()
+    run.wait(rolling.RETRY_S)
+    assert str(tmp_path) not in str([os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")])
+    assert run.log.trouble
+    disk.room = EVERYTHING
+    run.wait(rolling.RETRY_S)
+    run.take(100)
+    run.log.path.unlink()
+    run.take(10)
+    run.log.close()
+    assert numbers(run.log.path)[-10:] == list(range(200, 210))
+
+
+def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path, disk: Disk) -> None:
+    run = Run(tmp_path / "a.mcap", max_file_s=2.0)
+    disk.at_heads = errno.EACCES
+    run.take(3000)
+    why = os.strerror(errno.EACCES)
+    assert run.faults() == [f"no new file can be begun ({why}), so {tmp_path / 'a.mcap'} goes on"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]  # the half of another is removed
+    disk.at_heads = 0
+    run.take(100)
+    run.log.close()
+    first, second = parts(tmp_path / "a.mcap")
+    assert numbers(first) + numbers(second) == list(range(3100))
+
+
+def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_recovered(tmp_path: Path, disk: Disk) -> None:
+    run = Run(tmp_path / "a.mcap", chunk_s=0.1)
+    run.take(250)
+    disk.room = (tmp_path / "a.mcap").stat().st_size
+    with pytest.raises(RecorderError) as refused:
+        run.log.close(waiting=3)
+    recover(tmp_path / "a.mcap", tmp_path / "recovered")
+    kept = numbers(tmp_path / "recovered")
+    assert 0 < len(kept) < 250
+    assert kept == list(range(len(kept)))
+    assert str(refused.value) == (
+        f"{250 - len(kept) + 3} messages and the index of {tmp_path / 'a.mcap'} could not be written: "
+        f"{os.strerror(errno.ENOSPC)}; what came before is whole, and `aeroloop log recover` gives it an index"
+    )
+
+
+# ── files of a run ──
+
+
+@pytest.mark.parametrize("options", [{"max_file_mb": (HEAD + 50_000) / 1e6}, {"max_file_s": 0.4}])
+def test_each_file_of_a_run_can_be_read_alone_and_is_no_longer_than_configured_by_more_than_a_chunk(
+    tmp_path: Path, options: dict[str, float]
+) -> None:
+    run = Run(tmp_path / "a.mcap", **options)
+    run.take(1200)
+    run.log.close()
+    files, identities = parts(tmp_path / "a.mcap"), set()
     assert [path.name for path in files] == ["a.mcap", *(f"a-{part:04}.mcap" for part in range(1, len(files)))]
-    assert every_message(files) == numbered(story.messages)
-    if "max_file_mb" in settings:
-        data = [int.from_bytes(path.read_bytes()[-28:-20], "little") for path in files[:-1]]  # by their footers
-        assert all(LARGE <= size < LARGE + 12_000 + len(story.description) for size in data), "100 ms are up to 12 kB"
+    assert [number for path in files for number in numbers(path)] == list(range(1200))
+    if "max_file_mb" in options:
+        sizes = [int.from_bytes(path.read_bytes()[-28:-20], "little") for path in files[:-1]]  # without their indexes
+        assert all(HEAD + 49_000 < size < HEAD + 70_000 for size in sizes)
     else:
-        starts = [next(raw(path))[3] for path in files]
-        assert all(0.35e9 < b - a < 0.55e9 for a, b in pairwise(starts))
+        assert all(399 <= len(numbers(path)) <= 460 for path in files[:-1])
     for path in files:
         with path.open("rb") as file:
             reader = make_reader(file)
             found = [(one.name, dict(one.metadata)) for one in reader.iter_metadata()]
             attachments = {one.name: one.data for one in reader.iter_attachments()}
         assert attachments == {"protocol/SPEC.md": Path("protocol/SPEC.md").read_bytes()}
-        description = with_checksum(DESCRIPTION_METADATA, {"key": story.key, "json": story.description.decode()})
+        description = with_checksum(DESCRIPTION_METADATA, {"key": DESCRIPTION, "json": '{"a":1}'})
         assert [entries for name, entries in found if name == DESCRIPTION_METADATA] == [description] * 2
         (known,) = [json.loads(entries["json"]) for name, entries in found if name == RECORDER_METADATA]
         assert (known["run"], known["part"]) == ("a", path.stem)
         identities.add(known["id"])
     assert len(identities) == 1
+    assert run.reported == []
 
 
-def test_no_log_is_written_over(tmp_path: Path, story: EventLog, clock: Clock) -> None:
+def test_a_crash_costs_what_came_since_the_last_chunk_was_due(tmp_path: Path) -> None:
+    run = Run(tmp_path / "a.mcap", chunk_s=0.05, max_file_s=0.3)
+    for _ in range(40):
+        run.take(20)
+        assert sum(len(numbers(path)) for path in parts(tmp_path / "a.mcap")) >= run.count - 51
+    run.log.close()
+
+
+def test_a_chunk_is_written_when_it_is_large_though_it_is_not_yet_due(tmp_path: Path, disk: Disk) -> None:
+    run = Run(tmp_path / "a.mcap", chunk_s=60)
+    before = disk.calls
+    run.take(1000)
+    assert disk.calls - before >= 4
+    assert len(numbers(tmp_path / "a.mcap")) > 700
+    run.log.close()
+
+
+def test_no_log_is_written_over_and_where_none_can_be_made_one_line_names_it(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"mine")
     for _ in range(2):
-        recording = Recording(clock, story, path=tmp_path / "a.mcap")
-        recording.take(story.messages[:50])
-        recording.log.close()
+        run = Run(tmp_path / "a.mcap")
+        run.take(10)
+        run.log.close()
     assert (tmp_path / "a.mcap").read_bytes() == b"mine"
-    assert every_message([tmp_path / "a-0001.mcap"]) == numbered(story.messages[:50])
-    assert every_message([tmp_path / "a-0002.mcap"]) == numbered(story.messages[:50])
-
-
-def test_where_no_log_can_be_made_it_is_reported_in_one_line(tmp_path: Path, story: EventLog, clock: Clock) -> None:
-    (tmp_path / "file").write_bytes(b"")
+    assert [numbers(tmp_path / name) for name in ("a-0001.mcap", "a-0002.mcap")] == [list(range(10))] * 2
     with pytest.raises(RecorderError) as refused:
-        Recording(clock, story, path=tmp_path / "file" / "a.mcap")
-    assert str(tmp_path / "file" / "a.mcap") in str(refused.value)
+        Run(tmp_path / "a.mcap" / "b.mcap")
+    assert str(tmp_path / "a.mcap" / "b.mcap") in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-# ── what a crash costs ──
-
-
-def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path, story: EventLog, clock: Clock) -> None:
-    """Whatever stands in the file at any moment is older than `chunk_s`: nothing was closed here."""
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.25)
-    for done in range(50, 1001, 50):
-        recording.take(story.messages[done - 50 : done])
-        on_disk = list(records(tmp_path / "a.mcap"))
-        keys = {one.id for one in on_disk if isinstance(one, Channel) and not one.topic.startswith("/")}
-        count = sum(isinstance(one, Message) and one.channel_id in keys for one in on_disk)
-        assert done - count <= 0.25 / (TICK_S / 2) + 1
-    recording.log.close()
-
-
-def test_a_chunk_is_closed_when_it_is_large_though_it_is_not_yet_due(
-    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
-) -> None:
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=60)
-    small = story.messages[0]
-    recording.take([small])  # the very first is written at once
-    before = disk.writes
-    large = [Arrived(small.received._replace(payload=os.urandom(1000)), small.at_ns) for _ in range(1000)]
-    recording.take(large)
-    assert (tmp_path / "a.mcap").stat().st_size > 1e6 - CHUNK_BYTES
-    assert disk.writes - before == 1000 * (1000 + 31) // CHUNK_BYTES
-    recording.log.close()
-
-
-def test_chunks_that_are_full_before_they_are_due_put_off_no_new_file(
-    tmp_path: Path, story: EventLog, clock: Clock
-) -> None:
-    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1, max_file_s=0.4)
-    small = story.messages[0]
-    large = [Arrived(small.received._replace(payload=os.urandom(CHUNK_BYTES)), small.at_ns) for _ in range(600)]
-    recording.take(large)
-    recording.log.close()
-    assert len(in_order(tmp_path)) >= 600 * TICK_S / 2 / 0.5
-
-
-# ── names and retention ──
-
-
-def test_the_oldest_of_ones_own_go_and_no_other_file(tmp_path: Path, story: EventLog, clock: Clock) -> None:
-    others = {
-        "b.mcap": b"of another name",
-        "a-20261121.mcap": b"called as ours could be, and is not",
-        "a-0500.mcap": b"",
-        "a-0001.txt": b"no log",
-    }
-    for name, content in others.items():
-        (tmp_path / name).write_bytes(content)
-    Recording(clock, story, path=tmp_path / "another.mcap").log.close()
+def test_the_oldest_of_ones_own_go_and_no_other_file(tmp_path: Path) -> None:
+    for name in ("another", "a"):
+        Run(tmp_path / f"{name}.mcap").log.close()
     (tmp_path / "another.mcap").rename(tmp_path / "a-0400.mcap")
-    Recording(clock, story, path=tmp_path / "a.mcap").log.close()
     (tmp_path / "a.mcap").rename(tmp_path / "a-kept.mcap")  # somebody puts it aside
-    others |= {name: (tmp_path / name).read_bytes() for name in ("a-0400.mcap", "a-kept.mcap")}
-    for path in tmp_path.iterdir():
+    for name in ("b.mcap", "a-20261121.mcap", "a-0500.mcap", "a-0001.txt"):
+        (tmp_path / name).write_bytes(b"not ours")
+    others = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for path in others:
         os.utime(path, (0, 0))  # older than any of ours
-
-    recording = Recording(
-        clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=0.1, keep_gb=400e-6
-    )  # some five files
-    for i, arrived in enumerate(story.messages):
-        recording.take([arrived])
-        os.utime(recording.log.path, (1000 + i, 1000 + i))  # by the test's clock
-    recording.log.close()
-
-    assert {name: (tmp_path / name).read_bytes() for name in others} == others
-    own = [path for path in in_order(tmp_path) if path.name not in others]
-    numbers = [int(path.stem.removeprefix("a-")) for path in own]
-    assert numbers == list(range(numbers[0], numbers[0] + len(own)))
-    assert numbers[0] > 1, "the first ones are gone"
-    assert own[-1] == recording.log.path
+    run = Run(tmp_path / "a.mcap", max_file_s=0.1, keep_gb=350e-6)  # some four files
+    for i in range(1500):
+        run.take(1)
+        os.utime(run.log.path, (1000 + i, 1000 + i))
+    run.log.close()
+    assert {path: path.read_bytes() for path in others} == others
+    own = [path for path in parts(tmp_path / "a.mcap") if path not in others]
+    first = int(own[0].stem.removeprefix("a-"))
+    assert [path.name for path in own] == [f"a-{first + i:04}.mcap" for i in range(len(own))]
+    assert own[-1] == run.log.path
     sizes = [path.stat().st_size for path in own]
-    assert sum(sizes[:-1]) < 400e3 < sum(sizes) + max(sizes), "no more than needed"
-    removed = [text for text, _ in recording.reported if text.startswith("removed")]
-    assert len(removed) == numbers[0]
-    kept = every_message(own)
-    assert kept == numbered(story.messages)[-len(kept) :]
+    assert sum(sizes[:-1]) < 350e3 < sum(sizes) + max(sizes), "no more than needed"
+    assert len([text for text, _ in run.reported if text.startswith("removed")]) == first > 1
 
 
 @pytest.mark.parametrize("name", ["run1", "with.dot"])
-def test_in_a_folder_logs_are_named_by_the_time_and_kept_together_over_runs(
-    name: str, tmp_path: Path, story: EventLog, clock: Clock
-) -> None:
+def test_in_a_folder_logs_are_named_by_the_time_and_kept_together_over_runs(name: str, tmp_path: Path) -> None:
     """The file that is written stays, however little may be kept. A name without an ending is a folder."""
     folder = tmp_path / name
     if folder.suffix:
         folder.mkdir()
     for other in ("aeroloop-20200101-000000", "demo-1"):
-        Recording(clock, story, path=folder / f"{other}.mcap").log.close()
-    for place in ({"path": folder}, {"directory": folder}):
-        recording = Recording(clock, story, **place, chunk_s=0.05, max_file_s=2.0, keep_gb=1e-9)
-        recording.take(story.messages[:100])
-        recording.wait(3.0)
-        recording.take(story.messages[100:200])
-        recording.log.close()
-        assert TIMED.fullmatch(recording.log.path.name)
-        assert set(folder.iterdir()) == {folder / "demo-1.mcap", recording.log.path}
-        assert every_message([recording.log.path]) == numbered(story.messages[:200])[100:]
-    assert list(tmp_path.iterdir()) == [folder]
+        Run(folder / f"{other}.mcap").log.close()
+    run = Run(folder, keep_gb=1e-9, max_file_s=2.0)
+    run.take(100)
+    run.wait(3.0)
+    run.take(100)
+    run.log.close()
+    assert re.fullmatch(r"aeroloop-\d{8}-\d{6}-0001\.mcap", run.log.path.name)
+    assert set(folder.iterdir()) == {folder / "demo-1.mcap", run.log.path}
+    assert numbers(run.log.path) == list(range(100, 200))

@@ -9,30 +9,18 @@ import pytest
 
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import load
-from aeroloop.service.review.compare import Comparison, named_apart, read_runs
-from aeroloop.service.review.report import Check
-from aeroloop.service.review.requirements import broken_limits
+from aeroloop.service.review.compare import Comparison, read_runs
 from tests.support.made_log import make_log
-from tests.support.made_report import made_report
-
-
-def test_runs_are_named_apart_and_what_differs_is_named() -> None:
-    broken = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
-    runs = named_apart([made_report(), made_report(checks=[broken], settings={"law": {"C2": [0.3, 0.3, 0.3]}})])
-    compared = Comparison.of(runs)
-    assert list(compared.runs) == ["a.mcap", "a.mcap (2)"]
-    (differs,) = compared.differences
-    assert (differs.key, list(differs.values.values())) == ("law.C2", [[0.15, 0.15, 0.15], [0.3, 0.3, 0.3]])
-    assert [broken_limits(run.findings) for run in runs] == [[], ["skipped_ticks ≤ 0 does not hold: 50"]]
 
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    """Two runs that differ in a gain."""
+    """Two runs that differ in a gain, and in where their logs are."""
     folder = tmp_path_factory.mktemp("logs")
     for name, gain in (("calm", "0.15"), ("keen", "0.3")):
-        overrides = ["loop.lockstep=true", f"law.C2=[{gain}, {gain}, {gain}]"]
-        make_log(folder / f"{name}.mcap", 100, settings=load(overrides=overrides))
+        mine = [f"recorder.path={name}", f"network.rendezvous=tcp/127.0.0.1:{len(name)}"]
+        settings = load(overrides=["loop.lockstep=true", f"law.C2=[{gain}, {gain}, {gain}]", *mine])
+        make_log(folder / f"{name}.mcap", 100, settings=settings)
     return str(folder / "calm.mcap"), str(folder / "keen.mcap")
 
 
@@ -48,30 +36,29 @@ def test_logs_are_compared_in_the_terminal_as_json_and_on_a_page(
     assert list(tmp_path.iterdir()) == [out]
     assert run(("log", "compare", *logs, "--json")) == 0
     compared = loads(capfd.readouterr().out)
-    assert [difference["key"] for difference in compared["differences"]] == ["law.C2"]
+    values = {"calm": [0.15] * 3, "keen": [0.3] * 3}
+    assert compared["differences"] == [{"key": "law.C2", "values": values}]
     assert compared["runs"]["calm"]["z_track"] != compared["runs"]["keen"]["z_track"]
 
 
-def test_a_limit_holds_only_if_it_holds_for_every_run(logs: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_limit_holds_only_if_it_holds_for_every_run_and_pages_have_the_verdict(
+    logs: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert run(("log", "compare", *logs, "--require", "duration_s=0.2")) == 0
     assert run(("log", "compare", *logs, "--require", "duration_s=0.1")) == 1
     assert capfd.readouterr().err.splitlines()[-1].count("duration_s ≤ 0.1") == 2
     assert run(("log", "compare", logs[0])) == 2
     assert capfd.readouterr().err == "aeroloop: log compare takes two logs or more\n"
-
-
-def test_a_review_writes_its_page_with_its_verdict(
-    logs: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
     out = tmp_path / "page.html"
     assert run(("log", "review", logs[0], "--html", str(out), "--require", "z_track=1e-9")) == 1
     assert "Not held" in out.read_text()
     assert f"aeroloop: wrote {out}" in capfd.readouterr().err
 
 
-def test_logs_of_one_name_are_named_with_their_folders(logs: tuple[str, str], tmp_path: Path) -> None:
+def test_logs_of_one_name_are_named_with_their_folders_or_by_number(logs: tuple[str, str], tmp_path: Path) -> None:
     for folder, log in zip(("before", "after"), logs, strict=True):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "log.mcap").write_bytes(Path(log).read_bytes())
-    named = read_runs([tmp_path / "before/log.mcap", tmp_path / "after/log.mcap"])
-    assert [run.name for run in named] == ["before/log", "after/log"]
+    named = read_runs([tmp_path / "before/log.mcap", tmp_path / "after/log.mcap", tmp_path / "after/log.mcap"])
+    assert [run.name for run in named] == ["before/log", "after/log", "after/log (2)"]
+    assert list(Comparison.of(named).runs) == [run.name for run in named]

@@ -16,7 +16,6 @@ from aeroloop.service.logs.export import export
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.compare import Comparison, read_runs
 from aeroloop.service.review.review import read, report, review
 from tests.support.edited_log import message_of, rewrite
 from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, write
@@ -172,13 +171,3 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     assert execute(["log", "review", str(path)]) == 0
     out = " ".join(capfd.readouterr().out.split())
     assert f"ends disagree plant.aero.mass: controller {controller.plant.aero.mass}, plant 2.0" in out
-
-
-def test_runs_differ_by_what_their_plants_were_and_not_by_addresses(tmp_path: Path) -> None:
-    runs = []
-    for name, mass in (("a", "1.1"), ("b", "2.0")):
-        mine = [f"network.rendezvous=tcp/127.0.0.1:{len(name)}", f"recorder.path={name}", f"can.options.port={mass}"]
-        plant = load(overrides=[*mine, f"plant.aero.mass={mass}"])
-        controller = load(overrides=mine)
-        runs.append(write(tmp_path / f"{name}.mcap", controller, made(controller, 60), its={"plant": plant}))
-    assert [one.key for one in Comparison.of(read_runs(runs)).differences] == ["plant.aero.mass"]

@@ -15,8 +15,8 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Message, Points, Re
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.cli.main import execute
+from aeroloop.service.cli.op import WITHIN_S, as_commands
 from aeroloop.service.host import operator
-from aeroloop.service.terminal.as_commands import WITHIN_S, as_commands
 
 angle = st.floats(-1e4, 1e4)
 angles = st.tuples(angle, angle, angle)

@@ -10,8 +10,11 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from aeroloop.service.config import load
 from aeroloop.service.terminal import show as module
+from aeroloop.service.terminal.sheets import certificate_sheets
 from aeroloop.service.terminal.show import Row, show, show_all
+from aeroloop.service.theorem.certificate import certify
 
 ROWS: list[Row] = [
     {"law": "adaptive", **{f"figure {i} of several": f"{i}.{i} (×1.0{i})" for i in range(8)}, "reason": ""},
@@ -59,3 +62,21 @@ def test_csv_and_json_are_the_rows(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(csv.DictReader(StringIO(capsys.readouterr().out))) == ROWS
     show(ROWS, "laws", "json")
     assert json.loads(capsys.readouterr().out) == ROWS
+
+
+def test_a_certificate_shows_its_verdict_and_what_decides_and_on_request_every_term(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = certify(load())
+    texts = {}
+    for verbose in (False, True):
+        out = screen(monkeypatch, 80)
+        show_all(certificate_sheets(found, verbose))
+        lines = out.getvalue().splitlines()
+        assert max(map(cell_len, lines)) <= 80
+        texts[verbose] = " ".join(out.getvalue().split())
+        assert len(lines) <= 45 or verbose
+    assert texts[False].startswith(found.verdict)
+    assert f"--verbose prints all {len(found.terms)} terms" in texts[False]
+    words = texts[True].split()
+    assert all(word in words for term in found.terms for word in f"{term.symbol} ({term.equation})".split())

@@ -13,7 +13,7 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.theorem.any_law import OwnCertificate, certify_any, described_certificate
 from aeroloop.service.theorem.certificate import certify
-from aeroloop.service.theorem.configured import NoTheoremError
+from aeroloop.service.theorem.feedback import NoTheoremError
 
 HERE = "tests.service.theorem.test_any_law"
 
@@ -69,7 +69,7 @@ def test_a_law_that_brings_a_certificate_has_its_own(
 @pytest.mark.parametrize(
     ("kind", "line"),
     [
-        ("pd", "no theorem for this law, pd"),
+        ("sliding", "no theorem for this law, sliding"),
         (
             f"{HERE}:Boastful",
             f"the certificate of law {HERE}:Boastful is none: verdict: is missing",
@@ -91,5 +91,5 @@ def test_an_own_certificate_keeps_what_the_law_says() -> None:
 
 def test_a_description_carries_what_certify_prints_or_nothing() -> None:
     assert described_certificate(load()) == certify(load()).model_dump(mode="json")
-    for without in ("reference.kind=stream", "law.kind=pd"):
+    for without in ("reference.kind=stream", "law.kind=sliding"):
         assert described_certificate(load(overrides=[without])) is None

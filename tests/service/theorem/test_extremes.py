@@ -12,7 +12,6 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.service.config import load_over
 from aeroloop.service.control.reference import Angles, Floats, Plan
 from aeroloop.service.theorem.certificate import certify
-from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.extremes import body_rates, chords, extremes, feedforward, half_angles, vectors
 from tests.support.certified import bits, certified_settings
 
@@ -27,7 +26,7 @@ LOCKED = Sinusoid(amplitude=(20, 30, 60), frequency=(0.4, 0.3, 0.15))
 def largest(reference: Sinusoid, angles: Angles) -> Floats:
     """‖ω_d‖, ‖ω̇_d‖, max |ω_d,k|, half the angle, pitch, Σ|ε_k|, and each motor's voltage, of all these states."""
     settings = certified_settings().model_copy(update={"reference": reference})
-    law = with_theorem(settings).law
+    law = settings.law
     omega, omega_dot = body_rates(angles)
     found = [np.linalg.norm(omega, axis=1), np.linalg.norm(omega_dot, axis=1), np.abs(omega).max(axis=1)]
     found += [half_angles(angles), np.minimum(pi / 2, np.abs(angles.angle[:, 1])), np.abs(vectors(angles)).sum(axis=1)]

@@ -20,7 +20,7 @@ from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.theorem.evaluation import Evaluated, evaluate
+from aeroloop.service.theorem.certificate import Paper, evaluate
 from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
@@ -48,8 +48,14 @@ DELTAS = {
 LEMMA = tuple(DELTAS)
 
 
-def bounds(wire: WireSpec, error: float = ERROR) -> Evaluated:
-    return evaluate(Settings(wire=wire, law=LAW, reference=REFERENCE), attitude_error_deg=degrees(error))
+def bounds(wire: WireSpec, error: float = ERROR) -> Paper:
+    return paper_of(Settings(wire=wire, law=LAW, reference=REFERENCE), attitude_error_deg=degrees(error))
+
+
+def paper_of(settings: Settings, **options: float) -> Paper:
+    found = evaluate(settings, **options).paper
+    assert found is not None
+    return found
 
 
 def wire_of(bits: int) -> WireSpec:
@@ -68,7 +74,7 @@ def turns(axis: Floats, angle: Floats) -> Floats:
     return np.hstack([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * axis])
 
 
-def random_samples(wire: WireSpec, b: Evaluated, seed: int) -> tuple[Samples, Floats]:
+def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats]:
     """States along the reference, as far from it as was assumed, and what the law receives of them; and ω̇_d."""
     rng = np.random.default_rng(seed)
     motion, desired = Compiled(reference_function()), Plan.of(REFERENCE)
@@ -171,7 +177,7 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
     wire = wire_of(8).model_copy(update={"voltage": SignalSpec(bits=8, limit=1000.0)})  # no command saturates
     disturbance = 0.02
     settings = Settings(wire=wire, law=LAW, reference=REFERENCE)
-    b = evaluate(settings, disturbance=disturbance, attitude_error_deg=degrees(ERROR))
+    b = paper_of(settings, disturbance=disturbance, attitude_error_deg=degrees(ERROR))
     t = b.theorem
     assert t.k is not None
     x, omega_d_dot = random_samples(wire, b, seed=5)

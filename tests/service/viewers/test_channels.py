@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 from math import degrees, radians
 
@@ -77,22 +78,12 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
     sent: float | None, shown: float | None, saturated: bool | None
 ) -> None:
     (command,) = configured().take(address("command"), frame(WIRE.command, [VOLTS, VOLTS], [sent, -3.0]), NOW)
-    assert said(command) == dict.fromkeys(schemas.VOLTAGES.fields) | {
+    assert said(command) == dict.fromkeys(schemas.Voltages.model_fields) | {
         "voltage_2_v": shown if shown is None else pytest.approx(shown, abs=1e-4),
         "voltage_3_v": pytest.approx(VOLTS.quantize(-3.0), abs=1e-4),
         "saturated_2": saturated,
         "saturated_3": False,
     }
-
-
-@pytest.mark.parametrize("actuators", [1, 3, 8])
-def test_any_number_of_motors_without_a_quantizer_is_shown_and_no_more(actuators: int) -> None:
-    overrides = [f"wire.actuators={actuators}", "wire.voltage.bits=cont"]
-    volts = [1.5, -24.0, 0.0, 1.0, 2.0, 3.0, 4.0, 24.0][:actuators]
-    packed = load(None, overrides).wire.command.pack(0, volts)
-    (shown,) = configured(None, *overrides).take(address("command"), packed, NOW)
-    absent = [None] * (8 - actuators)
-    assert list(said(shown).values()) == [*volts, *absent, *(abs(u) == 24.0 for u in volts), *absent]
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -120,7 +111,7 @@ def test_truth_and_set_points_are_shown_as_they_were_published() -> None:
     assert list(said(shown).values()) == pytest.approx(expected, abs=1e-3)
     (shown,) = configured().take(address("reference"), Setpoint(attitude=(1.0, 2.0, 350.0)).encode(), NOW)
     assert shown.topic == "/aero/setpoint"
-    assert said(shown) == {"roll_deg": 1.0, "pitch_deg": 2.0, "yaw_deg": 350.0}
+    assert said(shown)["attitude"] == [1.0, 2.0, 350.0]
 
 
 @pytest.mark.parametrize(("kind", "rotors", "stands"), [("aero", 2, 1), ("rigid_body", 0, 0)])
@@ -134,8 +125,7 @@ def test_a_status_shows_state_and_recent_times_and_a_plants_brings_the_body_in_t
     found = by_topic(decoder.take(address("status"), STATUS.encode(), NOW))
     assert set(found) == {"/aero/status/plant", "/aero/scene"}
     shown = said(found["/aero/status/plant"])
-    names = ("state", "rate_hz", "skipped", "latency_p50_us", "latency_p99_us", "wake_p50_us", "age_p50_us")
-    assert [shown[name] for name in names] == ["driven", 500.0, 2, 310.0, 620.0, 50.0, None]
+    assert shown == json.loads(STATUS.encode())
     (controllers,) = decoder.take(address("status", "controller"), STATUS.encode(), NOW)
     assert controllers.topic == "/aero/status/controller"
     entities = [fields(entity) for entity in fields(found["/aero/scene"].data)[2]]
@@ -212,14 +202,6 @@ def test_silence_in_lockstep_shows_nothing_new_and_is_malformed_where_frames_are
     decoder = configured(25.0, "wire.transmit.measurement=on_change")
     assert [decoder.take(address(name), b"", NOW) for name in ("measurement", "command")] == [[], []]
     assert decoder.malformed == 1
-
-
-def test_vehicles_have_descriptions_and_rates_of_their_own() -> None:
-    decoder = configured(1.0)
-    decoder.configure(description("plant", vehicle="other"))
-    for vehicle in ("aero", "other"):
-        shown = decoder.take(address("trace", vehicle=vehicle), RAW["trace"], NOW)
-        assert {one.topic.split("/")[1] for one in shown} == {vehicle}
 
 
 # ── at which rate ──

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isnan
 from threading import Event
 
 import pytest
@@ -52,22 +51,6 @@ def test_the_loop_on_the_board_is_the_loop_on_the_emulator_to_the_last_bit(bits:
         assert on_board.tick() == emulated.tick()
     assert on_board.endpoint.state is PlantState.DRIVEN
     assert (plant.failures, board.time) == (0, 1000)
-
-
-def test_an_owner_that_ticks_by_what_has_passed_stays_in_the_boards_time() -> None:
-    plant, board = plant_on_board()
-    loop, wire = Loop(plant, Settings()), Settings().wire
-    assert plant.paces
-    k = 0
-    for stall in (0, 0, 3, 0, 1, 7, 0, 0):
-        board.let_pass(stall)
-        k += plant.passed
-        frame = loop.endpoint.tick(None, k)
-        assert frame is not None
-        read = wire.measurement.unpack(frame)
-        assert read is not None
-        assert not isnan(wire.attitude.quantizer().level(read[1][0]))
-        assert board.time == k + plant.passed - 1
 
 
 def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_trips_in_the_time_of_its_guard() -> (

@@ -40,12 +40,6 @@ def test_voltages_are_clipped_no_number_is_0_v_and_motors_can_be_crossed_and_tur
     assert board.analog == written
 
 
-def test_another_number_of_voltages_is_refused() -> None:
-    plant, _ = plant_on_board()
-    with pytest.raises(ValueError, match="argument"):
-        plant.actuate((1.0, 2.0, 3.0))
-
-
 def test_the_amplifier_is_on_during_a_session_only() -> None:
     plant, board = plant_on_board(session=False)
     for state in (PlantState.IDLE, PlantState.GRANTED, PlantState.DRIVEN, PlantState.TRIPPED, PlantState.IDLE):
@@ -82,26 +76,6 @@ def test_lights_show_the_state_and_are_written_when_it_changes() -> None:
     assert len(set(shown)) == list(board.calls).count("write_other") == 4
     strongest = {state: max(zip(colour, "rgb", strict=True))[1] for state, colour in COLOURS.items()}
     assert [strongest[s] for s in (PlantState.IDLE, PlantState.DRIVEN, PlantState.TRIPPED)] == ["b", "g", "r"]
-
-
-def test_a_light_that_fails_costs_no_sample() -> None:
-    plant, board = driven_plant()
-    board.fail_next("write_other")
-    plant.follow(PlantState.GRANTED)
-    calls = Calls(board)
-    plant.advance()
-    assert "watchdog_reload" in calls.names()
-    assert not is_nothing(plant.measure())
-
-
-def test_lights_come_back_with_the_outputs() -> None:
-    plant, board = expired_plant()
-    plant.follow(PlantState.GRANTED)
-    assert board.leds == list(COLOURS[PlantState.TRIPPED])  # the board's own
-    calls = Calls(board)
-    plant.actuate(OFF)
-    assert board.leds == list(COLOURS[PlantState.GRANTED])
-    assert "write_other" in calls.names()  # not every board may restore them by itself
 
 
 # The watchdog
@@ -159,14 +133,6 @@ def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_arme
     assert board.motor_voltages == OFF
     plant.advance()
     assert is_nothing(plant.measure())
-
-
-def test_an_enabled_amplifier_is_on_again_when_its_watchdog_is_cleared() -> None:
-    plant, board = expired_plant()
-    plant.follow(PlantState.GRANTED)
-    assert (board.expired, plant.failures) == (True, 1)  # the expiry: nothing was tried since
-    drive(plant, 1, OFF)
-    assert board.enabled == [True, True]
 
 
 @pytest.mark.parametrize("call", ["watchdog_start", "write_analog", "write_digital"])

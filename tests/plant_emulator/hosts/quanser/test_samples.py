@@ -7,13 +7,11 @@ from math import cos, pi, sin
 
 import pytest
 
-from aeroloop.plant_emulator.model.sensors import FilteredDerivative
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.plant_emulator.settings import CardType, QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
 from tests.support.fake_quanser import FakeQuanser
 from tests.support.quanser_board import (
-    PERIOD,
     Calls,
     HandClock,
     drive,
@@ -61,20 +59,6 @@ def test_counts_are_an_angle_each_with_its_sign(signs: tuple[int, int]) -> None:
     p, y = signs[0] * 2 * pi * 160 / 4000 / 2, signs[1] * 2 * pi * -512 / 5000 / 2
     half = cos(y) * cos(p), -sin(y) * sin(p), cos(y) * sin(p), sin(y) * cos(p)  # R_z(yaw) R_y(pitch)
     assert plant.measure().attitude == pytest.approx(half, abs=1e-15)
-
-
-def test_rates_are_the_filtered_derivative_in_the_body_frame() -> None:
-    plant, board = plant_on_board(bandwidth=30.0, damping_ratio=0.7)
-    of_pitch, of_yaw = (FilteredDerivative(30.0, 0.7, PERIOD) for _ in range(2))
-    of_pitch.update(0.0)
-    of_yaw.update(0.0)
-    for k in range(1, 200):
-        turn_encoders(board, 3 * k, -5 * k)
-        plant.advance()
-        p = 2 * pi / 2880 * 3 * k
-        dp, dy = of_pitch.update(p), of_yaw.update(-2 * pi / 4096 * 5 * k)
-        assert plant.measure().rate == pytest.approx((-sin(p) * dy, dp, cos(p) * dy), abs=1e-12)
-    assert dp > 3.0  # 3 counts a sample are 3.27 rad/s
 
 
 @pytest.mark.parametrize(("axes", "signs", "scale"), [((0, 1, 2), (1, 1, 1), 1.0), ((2, 0, 1), (1, -1, -1), 0.5)])
@@ -126,19 +110,6 @@ def test_after_a_failed_read_the_attitude_is_the_joints_and_the_filter_starts_an
     assert plant.measure().rate == (0.0, 0.0, 0.0)  # at rest until the filter has seen more
 
 
-def test_reads_that_fail_take_their_time(clock: HandClock) -> None:
-    """With nothing to wait for, a loop would spin."""
-    plant, board = plant_on_board()
-    plant.advance()
-    plant.advance()
-    assert clock.slept == []  # a good one has waited for its sample
-    board.fail_next("task_read", 3)
-    for work_ns in (500_000, 5_000_000, 0):  # of its owner: within a period, and longer than one
-        plant.advance()
-        clock.ns += work_ns
-    assert clock.slept == pytest.approx([PERIOD, PERIOD - 0.0005, 0.0], abs=1e-9)
-
-
 # Samples that are not read in time
 
 
@@ -160,34 +131,6 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
     plant.advance()
     assert not is_nothing(plant.measure())
     assert (board.time, plant.passed) == (now + 1, 1)
-
-
-def test_for_the_filter_the_newest_sample_lasts_as_long_as_those_that_were_lost() -> None:
-    plant, board = plant_on_board()
-    filtered = FilteredDerivative(50.0, 0.8, PERIOD)
-    filtered.update(0.0)
-    plant.advance()
-    filtered.update(0.0)
-    turn_encoders(board, 0, 40)
-    board.let_pass(4)
-    plant.advance()
-    for _ in range(4):
-        rate = filtered.update(2 * pi / 4096 * 40)
-    assert plant.measure().rate == (0.0, 0.0, rate)
-    assert rate > 0.5
-
-
-def test_a_failed_read_counts_as_a_period_once() -> None:
-    plant, board = driven_plant()
-    for _ in range(5):
-        board.fail_next("task_read")
-        plant.advance()
-        assert plant.passed == 1
-    plant.advance()
-    assert plant.passed == 1
-    board.let_pass(3)
-    plant.advance()
-    assert plant.passed == 3
 
 
 def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from random import Random
 from typing import get_args
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
+from aeroloop.service.control.laws.interface import gravity_torque
 from aeroloop.service.lab.experiment import experiment, run_experiment
 from tests.service.control.test_tick import frames
 from tests.support import failing_laws
@@ -107,7 +109,7 @@ def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_f
     found = experiment(own, 3.0)
     commands: list[bytes] = []
     assert found.figures == run_experiment(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
-    assert found.course is not None
+    assert found.compiled
     assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
     assert np.abs(found.course.voltages).max() > 1
 
@@ -116,12 +118,6 @@ def _codes(own: Settings, frame: bytes) -> Sequence[float]:
     read = own.wire.command.unpack(frame)
     assert read is not None
     return tuple(read[1])
-
-
-def test_an_experiment_with_python_goes_through_frames_and_has_the_same_figures() -> None:
-    found = experiment(configured(PYTHON), 1.0)
-    assert found.course is None
-    assert found.figures == experiment(configured(EXPRESSIONS), 1.0).figures
 
 
 # Laws that fail
@@ -153,3 +149,11 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     assert one.fault is not None
     assert WHY[failure].format(line=line) in one.fault
     assert len(one.fault.splitlines()) == 1
+
+
+def test_the_weights_torque_of_an_array_is_that_of_an_expression() -> None:
+    law, q = Settings().law, np.array([0.8, -0.2, 0.4, 0.4])
+    x = ca.SX.sym("x", 4)
+    expression = ca.Function("torque", [x], [gravity_torque(law, x)])
+    assert isinstance(gravity_torque(law, q), np.ndarray)
+    assert gravity_torque(law, q).tolist() == np.asarray(expression(q)).ravel().tolist()

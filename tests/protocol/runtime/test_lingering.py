@@ -10,7 +10,7 @@ import pytest
 
 PROGRAM = """
 import socket, struct, threading
-from aeroloop.protocol.transport.lingering import no_linger
+from aeroloop.protocol.runtime.realtime import no_linger
 
 def lingers():
     with socket.socket() as one:

@@ -1,0 +1,215 @@
+"""What the product costs, each figure beside its floor: `uv run python -m tests.benchmarks [PART ...]`.
+
+    … [--turns 3] [--seconds 20] [--rate 500] [--log-s 60] [--set KEY=VALUE] [tick loop start cell log]
+
+Product and floor take turns, so that both have the same share of what else the machine does; a row has the medians. A
+floor is what nobody could do without: the law's function alone, bare Zenoh, a bare sleep, the same loop in C, the
+`mcap` library's reader. Nothing is asserted. `--log-s 3600` is an hour of log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from mcap.reader import make_reader
+
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller, tick_function
+from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.lab import loop_function
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.review.review import review
+from tests.benchmarks import loop
+from tests.support.made_log import make_log
+
+
+class Row(NamedTuple):
+    """A figure beside its floor, if it has one."""
+
+    what: str
+    product: float
+    floor: float | None
+    floor_is: str
+
+    def cells(self) -> list[str]:
+        """The row as text."""
+        floor = ("–", "–") if self.floor is None else (f"{self.floor:.4g}", f"{self.product / self.floor:.2f}")
+        return [self.what, f"{self.product:.4g}", *floor, self.floor_is]
+
+
+def seconds_of(work: Callable[[], object]) -> float:
+    """How long some work takes [s]."""
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def in_turns(turns: int, product: Callable[[], object], floor: Callable[[], object]) -> tuple[float, float]:
+    """Median times of both [s]."""
+    pairs = [(seconds_of(product), seconds_of(floor)) for _ in range(turns)]
+    return median(ours for ours, _ in pairs), median(floors for _, floors in pairs)
+
+
+def tick(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
+    """The controller's tick, from a frame's bytes to a frame's bytes."""
+    frames: list[bytes] = []
+    run_experiment(settings, 4.0, watch=lambda _k, measurement, _command: frames.append(measurement))
+    wire, period = settings.wire, settings.loop.period
+    alone = Compiled(tick_function(wire, law_of(settings.law, period, wire.actuators)))
+
+    def ticks() -> None:
+        controller = Controller(wire, settings.law, settings.reference, period)
+        for k, frame in enumerate(frames):
+            controller.tick(frame, k)
+
+    def evaluations() -> None:
+        for _ in frames:
+            alone()
+
+    ours, floor = in_turns(10 * given.turns, ticks, evaluations)
+    yield Row("controller's tick, µs", 1e6 * ours / len(frames), 1e6 * floor / len(frames), "its CasADi function alone")
+
+
+def real_time(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
+    """Controller, plant and recorder as processes."""
+    overrides = [f"loop.rate_hz={given.rate}", *given.overrides]
+    z_track = loop.lockstep(given.seconds, overrides)
+    turns, trips, wakes = [], [], []
+    for _turn in range(given.turns):
+        turns.append(loop.turn(given.seconds, given.rate, overrides, z_track))
+        trips.append(loop.bare_round_trips(given.seconds / 4, given.rate))
+        wakes.append(loop.bare_wake_ups(given.seconds / 4, given.rate))
+    ticks, in_time, skipped = (sum(getattr(each, name) for each in turns) for name in ("ticks", "in_time", "skipped"))
+    for name, percent in (("p50", 50.0), ("p99", 99.0), ("p999", 99.9), ("longest", 100.0)):
+        floor = median(float(np.percentile(each, percent)) for each in trips)
+        ours = median(getattr(each, name) for each in turns)
+        yield Row(f"round trip p{percent:g}, µs (the period is {1e6 / given.rate:g})", ours, floor, "bare Zenoh")
+    floor = median(float(np.percentile(each, 99.9)) for each in wakes)
+    yield Row("wake-up p99.9, µs", median(each.wake_p999 for each in turns), floor, "a bare sleep to the same instants")
+    yield Row(f"ticks answered in time, % of {ticks}", 100 * in_time / ticks, 100, "all")
+    yield Row("ticks not answered", skipped, None, "")
+    yield Row("z_track in real time", median(each.over_lockstep for each in turns), 1, "in lockstep")
+    yield Row("memory of the largest process, MB", max(each.memory_mb for each in turns), *_imports())
+    for note in sorted({note for each in turns for note in each.notes}):
+        print(note, file=sys.stderr)
+
+
+def _imports() -> tuple[float, str]:
+    """Memory of an interpreter with the libraries that a controller cannot do without."""
+    code = "import casadi, numpy, pydantic, zenoh; input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
+        time.sleep(3.0)
+        found = loop.memory_mb(process.pid)
+        assert process.stdin is not None
+        process.stdin.write(b"\n")
+    return found, "its libraries, imported"
+
+
+def start_up(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
+    """Commands that print and end."""
+    bare = [sys.executable, "-c", "import typer, rich.console"]
+    for words in (["--help"], ["op", "stop", "--help"], ["lab", "experiment", "--duration=0.1"]):
+        ours, floor = in_turns(given.turns, partial(loop.run, *words), partial(subprocess.run, bare, check=True))
+        yield Row(f"aeroloop {' '.join(words)}, s", ours, floor, "Python with typer and rich")
+
+
+C_LOOP = """
+#include <string.h>
+#include "tick.c"
+void run(double *state, const double *desired, const double *wind, const double *error, double *out, int ticks) {
+  const double *arg[%(args)d];
+  double *res[%(results)d], after[%(states)d], w[%(work)d + 1];
+  casadi_int iw[%(ints)d + 1];
+  for (int k = 0; k < ticks; ++k) {
+    arg[0] = state; arg[1] = desired + 10 * k; arg[2] = wind + %(winds)d * k; arg[3] = error + 3 * k;
+    res[0] = after; res[1] = out + %(outs)d * k;
+    tick(arg, res, iw, w, 0);
+    memcpy(state, after, sizeof after);
+  }
+}
+"""
+
+
+def cell(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
+    """A cell of the paper's tables, 50 s, beside its ticks in a `for` loop in C; and all 26 cells."""
+    ticks = settings.loop.ticks(50.0)
+    while not loop_function.loop_of(settings).in_c:
+        run_experiment(settings, 50.0)
+    compiled = loop_function.loop_of(settings)
+    function, inputs = compiled.tick, compiled.inputs(settings, ticks)
+    sizes = {"args": function.sz_arg(), "results": function.sz_res(), "work": function.sz_w(), "ints": function.sz_iw()}
+    sizes |= {"states": function.size1_in(0), "winds": function.size1_in(2), "outs": function.size1_out(1)}
+    with tempfile.TemporaryDirectory() as folder:
+        generator = ca.CodeGenerator("tick.c")
+        generator.add(function)
+        generator.generate(f"{folder}/")
+        Path(folder, "run.c").write_text(C_LOOP % sizes)
+        command = ["cc", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "run.c", "-o", "run.so", "-lm"]
+        subprocess.run(command, cwd=folder, check=True)
+        library = ctypes.CDLL(f"{folder}/run.so")
+    columns = [np.ascontiguousarray(inputs[name]) for name in ("desired", "wind", "error")]
+    out = np.empty((ticks, sizes["outs"]))
+
+    arrays = [inputs["state"], *columns, out]
+    pointers = [array.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for array in arrays]
+    ours, floor = in_turns(
+        5 * given.turns, partial(run_experiment, settings, 50.0), partial(library.run, *pointers, ticks)
+    )
+    yield Row("a cell of 50 s with its figures, ms", 1e3 * ours, 1e3 * floor, "its ticks in a loop in C")
+    whole = median(seconds_of(partial(loop.run, "lab", "tables", "--json")) for _ in range(given.turns))
+    yield Row("aeroloop lab tables, s", whole, None, "")
+
+
+def log(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
+    """A log at 500 Hz, reviewed and replayed."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "made.mcap"
+        make_log(path, round(given.log_s / settings.loop.period), settings=settings, chunk_every=500)
+
+        def read() -> None:
+            with path.open("rb") as file:
+                for _ in make_reader(file).iter_messages():
+                    pass
+
+        for what, work in (("review", partial(review, path)), ("replay of both ends", partial(replay, [path]))):
+            ours, floor = in_turns(given.turns, work, read)
+            yield Row(f"{what} of {given.log_s:g} s of log, s", ours, floor, "its messages read by mcap")
+
+
+PARTS = {"tick": tick, "loop": real_time, "start": start_up, "cell": cell, "log": log}
+
+
+def main() -> None:
+    """Print the table, row by row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rate", type=float, default=500.0)
+    parser.add_argument("--log-s", type=float, default=60.0)
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    given = parser.parse_args()
+    if unknown := set(given.parts) - PARTS.keys():
+        parser.error(f"no such part: {', '.join(unknown)}")
+    print("| what | product | floor | ratio | the floor is |\n|---|--:|--:|--:|---|")
+    for part in given.parts or PARTS:
+        for row in PARTS[part](given, load(overrides=given.overrides)):
+            print("| " + " | ".join(row.cells()) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
