@@ -1,246 +1,247 @@
-"""Adversary of the certificate: the worst loops that this file can build stay within what is proven.
-
-A second closed loop in NumPy, many rows at once: body (C.1), (C.2), law (C.37), projection (C.38), θ̂ by Euler's rule,
-commands held for a period and delayed. Of the project it uses the configuration, and the bounds to compare with.
-
-The adversary chooses θ, θ̂(t₀), x(t₀) and the phase of the reference; and at every tick the errors of ε, ω and u, each
-at a vertex of (C.13), and τ_d. It computes the law for every vertex and takes the one whose torque pushes most along a
-costate of the linear error equations, so that (ε̃, z₂) is large at the end, or along z₂.
-"""
+"""Adversary of the certificate: the worst loops that `adversary_loop` can build stay within what is proven."""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from functools import lru_cache
-from itertools import product
-from math import sin
-from typing import Any, Final
+from math import asin, hypot, pi, sin
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from scipy.linalg import expm
 
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.theorem.certificate import certify
-from aeroloop.service.theorem.configured import with_theorem
-from aeroloop.service.theorem.evaluation import evaluate, largest_voltage
-from aeroloop.service.theorem.invariant import largest_start, reach
+from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate, largest_voltage, premises
+from aeroloop.service.theorem.invariant import reach
+from aeroloop.service.theorem.plant_bounds import plant_bounds
+from tests.support import adversary_loop as loop
 from tests.support import numpy_twin as twin
-from tests.support.certified import FREE, bits
+from tests.support.adversary_loop import QUANTITIES, Array, norm, unit
 from tests.support.twin_body import body_of
 
-Array = npt.NDArray[np.float64]
-ROWS: Final = 32
-DURATION_S: Final = 2.0
-"""Of an experiment: the error equations decay by e⁻⁷."""
-VERTICES: Final = np.array(list(product((-1.0, 1.0), repeat=6)))
-"""Signs of the errors of ε and ω. Shape (64, 6)."""
-CONFIGURATIONS: Final[dict[str, tuple[tuple[str, ...], int, float]]] = {
-    "the paper's body at 8/6 bits": (("law.damping_bound=0.0119", *bits(8, 6)), 0, 0.0),
-    "a free body at 12/12 bits": ((*FREE, *bits(12, 12)), 0, 0.0),
-    "a free body at 10/8 bits, two ticks late, pushed": ((*FREE, *bits(10, 8)), 2, 0.0005),
-}
-"""Overrides, delay [ticks], largest disturbance [N·m]."""
-QUANTITIES: Final = ("‖z‖", "|ω_k|", "|ε_k|", "|u_k|", "∫k‖z‖² dt over what (C.77) allows")
-STARTS: Final = (0.0, 0.25)
-"""Largest ‖x(t₀)‖, as a share of the largest that is proven to come back."""
+LEAST: Final = 0.1
+"""What the adversary reaches of every bound of ‖z‖; of most it reaches 0.2 to 0.9."""
 
 
-def to_body(q: Array, v: Array) -> Array:
-    """Rᵀ(q) v: from the inertial frame to the body's, without a matrix."""
-    eps = q[..., 1:]
-    t = 2 * np.cross(eps, v)
-    found: Array = v - q[..., :1] * t + np.cross(eps, t)
-    return found
+class Case(NamedTuple):
+    """A configuration's overrides, and what the adversary may do.
+
+    Commands may be `late` by these ticks, by frames lost in a row if `loss`, else by a delay that changes; τ_d may be
+    `disturbance` [N·m], and ‖x(t₀)‖ this share of the radius.
+    """
+
+    changes: tuple[str, ...]
+    late: int = 0
+    loss: bool = False
+    disturbance: float = 0.0
+    start: float = 0.0
 
 
-def norm(v: Array) -> Array:
-    length: Array = np.sqrt((v * v).sum(axis=-1))
-    return length
+def bits(attitude: int | str, rate: int | str, voltage: int | str) -> tuple[str, ...]:
+    return f"wire.attitude.bits={attitude}", f"wire.rate.bits={rate}", f"wire.voltage.bits={voltage}"
 
 
-class Loop:
-    """Body and law of a configuration; every quantity may have any leading shape."""
-
-    def __init__(self, settings: Settings) -> None:
-        law = with_theorem(settings).law
-        self.J, self.C1, self.C2, self.Gamma = (np.array(v) for v in (law.inertia, law.C1, law.C2, law.Gamma))
-        self.B, self.k_theta = np.array(law.allocation), law.damping_bound
-        self.B_inverse: Array = np.linalg.inv(self.B)
-        self.r_g, self.weight = np.array(law.centre_of_mass), np.array([0.0, 0.0, -law.mass * law.gravity])
-        self.K = np.concatenate([1 / (1 + self.C1 * self.C2), self.C1 / (1 + self.C1 * self.C2)])
-        self.period = settings.loop.period
-
-    def errors(self, q: Array, omega: Array, q_d: Array, omega_d: Array) -> tuple[Array, Array, Array, Array]:
-        """η̃, ε̃, ω_e and z₂ of the equilibrium η̃ = 1."""
-        eta, eps, eta_d, eps_d = q[..., :1], q[..., 1:], q_d[..., :1], q_d[..., 1:]
-        eta_e: Array = eta_d * eta + (eps_d * eps).sum(axis=-1, keepdims=True)
-        eps_e = eta_d * eps - eta * eps_d - np.cross(eps_d, eps)
-        omega_e = omega - to_body(q, omega_d)
-        return eta_e, eps_e, omega_e, omega_e + self.C1 * eps_e
-
-    def drift(self, q: Array, omega: Array) -> Array:
-        """Ψ: what the body turns by without command and damping."""
-        return np.cross(self.r_g, to_body(q, self.weight)) - np.cross(omega, self.J * omega)
-
-    def torque(self, q: Array, omega: Array, desired: tuple[Array, Array, Array], theta: Array) -> tuple[Array, Array]:
-        """B u and z₂ by the law; θ̂ as `theta`."""
-        q_d, omega_d, omega_d_dot = desired
-        eta_e, eps_e, omega_e, z2 = self.errors(q, omega, q_d, omega_d)
-        alpha_dot = -self.C1 / 2 * (eta_e * omega_e + np.cross(eps_e, omega_e))
-        feedforward = np.cross(omega, to_body(q, omega_d)) - to_body(q, omega_d_dot) - alpha_dot
-        return -eps_e - self.C2 * z2 + omega * theta - self.drift(q, omega) - self.J * feedforward, z2
-
-    def adapted(self, theta: Array, omega: Array, z2: Array) -> Array:
-        """θ̂ a period later: projected, then clipped to the outer ball."""
-        tau, outer = -self.Gamma * omega * z2, self.k_theta / 0.95
-        passed = (norm(theta) ** 2 - self.k_theta**2) / (outer**2 - self.k_theta**2)
-        outward = (theta * tau).sum(axis=-1)
-        along = self.Gamma * theta / np.maximum((theta * self.Gamma * theta).sum(axis=-1), 1e-300)[:, None]
-        acts = (passed > 0) & (outward > 0)
-        after = theta + self.period * (tau - (acts * np.minimum(passed, 1) * outward)[:, None] * along)
-        clipped: Array = after * np.minimum(1, outer / np.maximum(norm(after), 1e-300))[:, None]
-        return clipped
-
-    def advance(self, x: Array, torque: Array, theta: Array) -> Array:
-        """The body after a period, by one Runge–Kutta step; x is (q, ω)."""
-
-        def slope(x: Array) -> Array:
-            q, omega = x[:, :4], x[:, 4:]
-            q_dot = np.hstack([-(q[:, 1:] * omega).sum(1, keepdims=True), q[:, :1] * omega + np.cross(q[:, 1:], omega)])
-            return np.hstack([q_dot / 2, (self.drift(q, omega) - theta * omega + torque) / self.J])
-
-        h = self.period
-        b = slope(x + h / 2 * (a := slope(x)))
-        c = slope(x + h / 2 * b)
-        x = x + h / 6 * (a + 2 * b + 2 * c + slope(x + h * c))
-        x[:, :4] /= norm(x[:, :4])[:, None]
-        return x
-
-    def costates(self, target: Array, ticks: int) -> Array:
-        """Effect of the torque of each tick on target · (ε̃, z₂) at the end. Shape (ticks, rows, 3)."""
-        found = np.empty((ticks, len(target), 3))
-        for k, (c1, c2, j) in enumerate(zip(self.C1, self.C2, self.J, strict=True)):
-            step = expm(np.array([[-c1 / 2, 0.5], [-1 / j, -c2 / j]]) * self.period)
-            impulse = np.array([0.0, 1 / j])
-            for i in reversed(range(ticks)):
-                found[i, :, k] = target[:, k] * impulse[0] + target[:, 3 + k] * impulse[1]
-                impulse = step @ impulse
-        return found
+def swing(amplitude: str, frequency: str) -> tuple[str, ...]:
+    return f"reference.amplitude=[{amplitude}]", f"reference.frequency=[{frequency}]"
 
 
-def unit(rng: np.random.Generator, size: int) -> Array:
-    v = rng.standard_normal((ROWS, size))
-    return v / norm(v)[:, None]
+def law(kind: str, *changes: str, hz: float = 250) -> tuple[str, ...]:
+    return f"law.kind={kind}", f"loop.rate_hz={hz}", *(f"law.{change}" for change in changes)
 
 
-def attack(settings: Settings, *, start: float, delay: int, disturbance: float, k: float, delta: float) -> Array:
-    """Run all rows; k and δ_Q are those of (C.77). Returns the largest of each of QUANTITIES."""
-    rng, loop, wire = np.random.default_rng(1), Loop(settings), settings.wire
-    ticks = settings.loop.ticks(DURATION_S)
-    deltas = [signal.quantizer().bound for signal in (wire.attitude, wire.rate, wire.voltage)]
-    acts = np.arange(3) >= 3 - wire.actuators  # with two motors u₁ is not quantized
-    reference: Any = settings.reference
-    path = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency))
-    cycle = np.arange(0, 40, loop.period)
-    desired = [np.array(part) for part in zip(*map(path.desired, cycle), strict=True)]
-    rates = to_body(desired[0], desired[1])
+def rotors(up: float, down: float) -> tuple[str, ...]:
+    return f"plant.rotor.lag_up_s={up}", f"plant.rotor.lag_down_s={down}"
 
-    # θ̃ as large as it can be, along an axis of the fastest turn at the end; every fourth row takes any phase.
-    end = np.argsort(-np.abs(rates).max(axis=1))[rng.integers(0, 200, ROWS)]
-    end[::4] = rng.integers(0, len(cycle), len(end[::4]))
-    first = (end - ticks) % len(cycle)
-    theta = np.identity(3)[np.abs(rates[end]).argmax(axis=1)] * rng.choice([-1.0, 1.0], (ROWS, 1))
-    theta[::3] = unit(rng, 3)[::3]
-    theta_hat = -theta * loop.k_theta / 0.95
-    theta *= loop.k_theta
 
-    def now(i: int) -> tuple[Array, Array, Array]:
-        at = (first + i) % len(cycle)
-        return desired[0][at], desired[1][at], desired[2][at]
+PERFECT: Final = (
+    "loop.lockstep=true", "plant.friction.viscous=[]", "plant.friction.coulomb=[]", *rotors(0, 0),
+    "plant.sensors.attitude=perfect", "plant.sensors.rate=perfect",
+)  # fmt: skip
+FREE: Final = (
+    *PERFECT, "plant.kind=rigid_body", "plant.rigid_body.damping=[0, 0.006, 0.006]", "wire.actuators=3",
+    "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]",
+    "law.damping_bound=0.0119",
+)  # fmt: skip
+AERO: Final = (
+    *PERFECT, *swing("0, 10, 40", "0, 0.1, 0.07"), "plant.aero.centre_of_mass=[0, 0, -0.0038]", "wire.voltage.limit=60",
+    "plant.friction.viscous=[0.0071, 0.022]", "law.damping_estimate=[0.022, 0.0071, 0.022]", "law.damping_bound=0.003",
+    "plant.voltage_limit=60",
+)  # fmt: skip
+IDEAL: Final = (
+    "loop.lockstep=true", "plant.ideal=true", "law.damping_bound=0.0135", *swing("0, 10, 60", "0, 0.1, 0.07"),
+)  # fmt: skip
+ENCODERS: Final = ("plant.sensors.attitude=encoders", "plant.sensors.rate=derivative")
+BODY: Final = (
+    "law.inertia=[0.02, 0.03, 0.01]", "plant.rigid_body.inertia=[0.02, 0.03, 0.01]",
+    "law.centre_of_mass=[0.002, 0.001, -0.0038]", "plant.rigid_body.centre_of_mass=[0.002, 0.001, -0.0038]",
+)  # fmt: skip
+THREE_AXES: Final = (*FREE, *bits("cont", "cont", "cont"), *swing("60, 50, 80", "0.04, 0.04006, 0.04002"))
+SLOW: Final = ("damping_bound=0.002", "damping_estimate=[0, 0.006, 0.006]", "C2=[0.25, 0.25, 0.25]")
+GYRO: Final = ("sensors.rate=gyro", "sensors.gyro_noise=0.001", "sensors.gyro_bias=[0.002, 0, -0.001]")
+CASES: Final = {
+    "8/8/6 bits": Case((*FREE, *bits(8, 8, 6), *law("adaptive"))),
+    "10/6/6 bits, from afar": Case((*FREE, *bits(10, 6, 6), *law("adaptive")), start=0.3),
+    "12 bits": Case((*FREE, *bits(12, 12, 12), *law("adaptive"))),
+    "16 bits, 500 Hz": Case((*FREE, *bits(16, 16, 16), *law("adaptive", hz=500))),
+    "three moments and a weight": Case((*FREE, *bits(12, 12, 12), *BODY, *law("adaptive"))),
+    "unequal C₁, C₂": Case((*FREE, *bits(10, 10, 10), *law("adaptive", "C1=[0.3, 1.0, 0.5]", "C2=[0.3, 0.15, 0.25]"))),
+    "unequal Γ": Case((*FREE, *bits(12, 12, 12), *law("adaptive", "Gamma=[0.2, 0.02, 0.05]"))),
+    "three axes, no bits": Case((*THREE_AXES, *law("adaptive", "C1=[1, 1, 1]", "C2=[0.3, 0.3, 0.3]", hz=500))),
+    "10 ms late": Case((*FREE, *bits(12, 12, 12), *law("adaptive", hz=500)), late=5),
+    "12 frames lost": Case((*FREE, *bits(10, 10, 10), *law("adaptive", hz=500)), late=12, loss=True),
+    "real time, pushed": Case((*FREE, *bits(12, 12, 12), "loop.lockstep=false", *law("adaptive")), 1, disturbance=1e-3),
+    "Coulomb friction": Case((*FREE, *bits(12, 12, 12), "plant.friction.coulomb=[0.0005, 0.0003]", *law("adaptive"))),
+    "gyro": Case((*FREE, *bits(12, 12, 12), *(f"plant.{each}" for each in GYRO), *law("adaptive"))),
+    "nonadaptive": Case((*FREE, *bits(12, 12, 12), *law("nonadaptive"))),
+    "nonadaptive, late, from afar": Case((*FREE, *bits(10, 10, 10), *law("nonadaptive")), late=3, start=0.5),
+    "PD": Case((*FREE, *bits(12, 12, 12), *law("pd"))),
+    "PD, pushed hard": Case((*FREE, *bits(12, 12, 12), *law("pd")), disturbance=2e-2),
+    "PD, late, pushed": Case((*FREE, *bits(10, 8, 8), *law("pd")), late=2, disturbance=1e-3),
+    "PID": Case((*FREE, *bits(12, 12, 12), *law("pid", hz=100))),
+    "PID, late, pushed": Case((*FREE, *bits(10, 10, 10), *law("pid", hz=100)), late=1, disturbance=2e-3),
+    "PID, rotors": Case((*FREE, *bits(10, 10, 10), *rotors(0.02, 0.02), *law("pid", hz=100))),
+    "rotors": Case((*FREE, *bits(12, 12, 12), *rotors(0.02, 0.02), *law("adaptive"))),
+    "rotors, up and down": Case((*FREE, *bits(12, 12, 12), *rotors(0.02, 0.03), *law("adaptive"))),
+    "slow rotors": Case((*FREE, *bits(12, 12, 12), *rotors(0.1, 0.11), *law("adaptive", *SLOW))),
+    "held roll": Case((*IDEAL, *bits(12, 12, 12), *law("adaptive"))),
+    "held roll, nonadaptive, late": Case((*IDEAL, *bits(10, 10, 10), *law("nonadaptive")), late=1),
+    "held roll, PD, rotors": Case((*AERO, *bits(12, 12, 12), *rotors(0.03, 0.032), *law("pd", hz=500))),
+    "held roll, PD, encoders": Case((*AERO, *bits(12, 12, 12), *ENCODERS, *law("pd", hz=500))),
+    "held roll, encoders": Case((*AERO, *bits(12, 12, 12), *ENCODERS, *law("adaptive", SLOW[2], hz=500))),
+}  # fmt: skip
 
-    q_d, omega_d, _ = now(0)
-    slow = -rates[first] * (theta - theta_hat)
-    eps_e, z2 = np.hsplit(start * unit(rng, 6) + loop.K * np.hstack([slow, slow]), 2)
-    e = np.hstack([np.sqrt(1 - norm(eps_e)[:, None] ** 2), eps_e])
-    eta = q_d[:, :1] * e[:, :1] - (q_d[:, 1:] * eps_e).sum(axis=1, keepdims=True)
-    q = np.hstack([eta, q_d[:, :1] * eps_e + e[:, :1] * q_d[:, 1:] + np.cross(q_d[:, 1:], eps_e)])
-    x = np.hstack([q, z2 - loop.C1 * eps_e + to_body(q, omega_d)])
-    V = ((1 - e[:, 0]) ** 2 + norm(eps_e) ** 2) + (z2**2 @ loop.J + (theta - theta_hat) ** 2 @ (1 / loop.Gamma)) / 2
 
-    # Where to drive the error: on along the slow disturbance at the end, or anywhere.
-    pushed = np.sign(-rates[end] * (theta - theta_hat))
-    target = np.tile(pushed * (np.abs(rates[end]) > 1e-3), 2) * rng.uniform(0, 1, (ROWS, 6))
-    target[::2] = unit(rng, 6)[::2]
-    costates = loop.costates(target, ticks)
-    greedy = np.arange(ROWS) % 6 == 5
-    found, square, waiting = np.zeros(5), np.zeros(ROWS), list[Array]()
-    for i in range(ticks):
-        desired_now, q, omega = now(i), x[:, :4], x[:, 4:]
-        eta_e, eps_e, _, z2 = loop.errors(q, omega, *desired_now[:2])
-        z = np.sqrt((1 - eta_e[:, 0]) ** 2 + norm(eps_e) ** 2 + norm(z2) ** 2)
-        square += loop.period * z**2
-        p = np.where(greedy[:, None], z2, costates[i])
+class Attacked(NamedTuple):
+    """A configuration, what is proven of it, the largest of QUANTITIES found, and their shares of the bounds."""
 
-        eps_Q = q[:, None, 1:] + deltas[0] * VERTICES[:, :3]
-        rest = np.sqrt(np.maximum(0.0, 1 - norm(eps_Q) ** 2))[..., None]
-        q_Q = np.concatenate([np.where(q[:, None, :1] < 0, -rest, rest), eps_Q], axis=2)
-        q_Q /= norm(q_Q)[..., None]  # Remark 2, where ‖ε^Q‖ > 1
-        omega_Q = omega[:, None] + deltas[1] * VERTICES[:, 3:]
-        each = tuple(part[:, None] for part in desired_now)
-        torques, z2_Q = loop.torque(q_Q, omega_Q, (each[0], each[1], each[2]), theta_hat[:, None])
-        best = (np.arange(ROWS), (torques * p[:, None]).sum(axis=2).argmax(axis=1))
-        u = torques[best] @ loop.B_inverse.T
-        theta_hat = loop.adapted(theta_hat, omega_Q[best], z2_Q[best])
-        waiting.append((u + deltas[2] * acts * np.sign(p @ loop.B)) @ loop.B.T)
-        tau_d = disturbance * p / np.maximum(norm(p), 1e-300)[:, None]
-        x = loop.advance(x, waiting[max(0, i - delay)] + tau_d, theta)
+    settings: Settings
+    proven: Evaluated
+    found: Array
+    shares: Array
 
-        mean_square = k * square / (V + delta * loop.period * (i + 1))
-        now_found = (z, np.abs(omega), np.abs(q[:, 1:]), np.abs(u[:, acts]), mean_square)
-        found = np.maximum(found, [each.max() for each in now_found])
-    return found
+
+def attack(cases: dict[str, Case], *, rows: int = 24, generations: int = 3, ticks: int = 600) -> dict[str, Attacked]:
+    known, limits, proven = list[dict[str, Any]](), list[list[float]](), list[tuple[Settings, Evaluated]]()
+    for i, (name, case) in enumerate(cases.items()):
+        settings = load_over(Settings(), case.changes)
+        late_s = case.late * settings.loop.period * settings.loop.lockstep  # in real time the first tick is none
+        options = {"disturbance": case.disturbance, "late_s": late_s}
+        e = evaluate(settings, **options)
+        assert certify(settings, **options, margins=False).holds, name
+        assert e.plant_reach is not None
+        at = reach(e.plant, start := case.start * e.plant_reach.radius)
+        assert at is not None, name
+        volts = largest_voltage(settings, e.desired, at)
+        limits.append([at.radius, at.eps_e, at.omega_e, at.axis_rate, sin(at.half_angle), volts])
+        numbers = loop.constants(settings, case.late, loss=case.loss, disturbance=case.disturbance)
+        known.append(numbers | {"start": [start], "case": [i]})
+        proven.append((settings, e))
+    best = loop.worst(known, rows, generations, ticks)
+    return {name: Attacked(*proven[i], best[i], best[i] / limits[i]) for i, name in enumerate(cases)}
 
 
 @lru_cache
-def shares(name: str, start_share: float) -> dict[str, float]:
-    """What the adversary reaches, each as a share of its bound."""
-    overrides, delay, disturbance = CONFIGURATIONS[name]
-    settings = load_over(Settings(), overrides)
-    late_s = delay * settings.loop.period
-    e = evaluate(settings, disturbance=disturbance, late_s=late_s)
-    start = start_share * largest_start(e.body)
-    at, k, delta = reach(e.body, start), e.theorem.k, e.theorem.delta_Qdist
+def attacked() -> dict[str, Attacked]:
+    found = attack(CASES)
+    lines = [f"{name:30}" + "".join(f"{share:8.3f}" for share in one.shares) for name, one in found.items()]
+    sys.stdout.write("\n".join(["", " " * 30 + "".join(f"{name:>8}" for name in QUANTITIES), *lines, ""]))
+    return found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_loop_of_an_adversary_exceeds_what_is_proven(name: str) -> None:
+    shares = attacked()[name].shares
+    assert shares.max() <= 1
+    assert shares[0] > LEAST
+
+
+def test_the_adversary_comes_near_to_what_is_proven() -> None:
+    assert max(one.shares[0] for one in attacked().values()) > 0.8
+    assert np.median([one.shares[0] for one in attacked().values()]) > 0.3
+
+
+@pytest.mark.xfail(strict=True, reason="D₄ has no term for what PID does not integrate while measurements are lost")
+def test_measurements_lost_before_a_pid_law_are_within_what_is_proven() -> None:
+    """Two of three, so that the integral falls a third as fast as it rises."""
+    changes = (*FREE, *bits("cont", "cont", "cont"), *swing("0, 40, 80", "0, 0.2, 0.2"), *law("pid"))
+    found = attack({"PID": Case(changes, late=2, loss=True)}, rows=12, generations=2, ticks=2000)["PID"]
+    assert found.shares.max() <= 1
+
+
+# ── the repaired defects: without the repair the bound is beaten ──
+
+
+def test_extremes_of_eight_slow_periods_are_beaten() -> None:
+    """Of three nearly equal frequencies; suprema over all phases are larger."""
+    one = attacked()["three axes, no bits"]
+    c = loop.rows_of([loop.constants(one.settings)])
+    q_d, omega_d, omega_d_dot = loop.desired(c, np.linspace(0, 16 * pi / c.frequency.min(), 100_000))
+    desired = one.proven.desired._replace(
+        rate=1.005 * norm(omega_d).max(),
+        acceleration=1.005 * norm(omega_d_dot).max(),
+        axis_rate=1.005 * np.abs(omega_d).max(),
+        half_angle=1.005 * asin(norm(q_d[:, 1:]).max()),
+    )
+    at = reach(premises(one.settings, desired, plant_bounds(one.settings, stated=True)))
     assert at is not None
-    assert k is not None
-    if not start:
-        assert certify(settings, disturbance=disturbance, late_s=late_s).pointwise_radius == at.radius
-    found = attack(settings, start=start, delay=delay, disturbance=disturbance, k=k, delta=delta)
-    bounds = (at.radius, at.axis_rate, sin(at.half_angle), largest_voltage(settings, e.desired, at), 1.0)
-    return dict(zip(QUANTITIES, found / bounds, strict=True))
+    assert one.found[0] > 1.1 * at.radius
 
 
-@pytest.mark.parametrize("start", STARTS)
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_no_loop_of_an_adversary_exceeds_what_is_proven(name: str, start: float) -> None:
-    assert max(shares(name, start).values()) <= 1
+def test_the_noise_of_unequal_gains_as_if_they_were_equal_is_beaten() -> None:
+    """Parts of one error are at right angles to each other only where C₁ and C₂ are multiples of the identity."""
+    changes = (*FREE, *bits(12, "cont", "cont"), *swing("0, 40, 100", "0, 0.7, 0.7"))
+    settings = load_over(Settings(), (*changes, *law("adaptive", "C2=[0.4, 0.1, 0.1]")))
+    p = evaluate(settings).plant
+    # Nothing but the attitude's quantization, and a body so light that ε̃ and C₂z₂ are all of the law.
+    known = p.law._replace(radius=0.0, reach=0.0, centre=(0.0, 0.0, 0.0), alpha=(0.0, 0.0, 0.0))
+    p = replace(p, law=known, J=(1e-5, 1e-5, 1e-5), period=0.0, age=0.0)
+    at = reach(p)
+    assert at is not None
+    delta, kp, turned = p.delta_q(asin(at.eps_e)), max(p.law.kp), 2 * max(p.law.kd) * p.k_omega_d
+    equal = delta * hypot(kp, kp * at.eps_e + turned) + delta**2 * (kp * at.eps_e / 2 + turned)
+
+    c = loop.rows_of([loop.constants(settings) | {"J": np.zeros(3)}])
+    rng, nil = np.random.default_rng(3), np.zeros((2000, 3))
+    q_d, omega_d = unit(rng.standard_normal((2000, 4))), p.k_omega_d * unit(rng.standard_normal((2000, 3)))
+
+    def moved_by(turn: Array) -> Array:
+        q = loop.times(q_d, np.concatenate([np.sqrt(1 - loop.dot(turn, turn)), turn], axis=1))
+        return loop.torque_of(c, q, omega_d, (q_d, omega_d, nil), nil, nil)[0]
+
+    worst = np.linalg.svd(np.stack([moved_by(nil + 1e-6 * axis) for axis in np.identity(3)], axis=2))[2][:, 0]
+    reached = norm(moved_by(np.sin(2 * np.arcsin(delta / 2)) * worst)).max()
+    assert equal * 1.05 < reached <= at.noise
 
 
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_an_adversary_exceeds_half_of_what_is_proven(name: str) -> None:
-    assert max(shares(name, start)["‖z‖"] for start in STARTS) > 0.5
+def test_unequal_lags_as_if_motors_stood_at_right_angles_are_beaten() -> None:
+    """The share of what lags by which rotors err, of the Aero's two motors."""
+    settings = load_over(Settings(), rotors(0.1, 0.2))
+    c = loop.rows_of([loop.constants(settings)])
+    V, u = np.random.default_rng(4).uniform(-24, 24, (2, 20_000, 3)) * [0, 1, 1]
+    mean = 2 * c.up * c.down / (c.up + c.down)
+    lags, errs = (u - V) @ c.B[0].T, ((mean / loop.rotor_lag(c, V, u) - 1) * (u - V)) @ c.B[0].T
+    reached = (norm(errs) / norm(lags)).max()
+    right_angles = abs(c.up - c.down).item() / (c.up + c.down).item()
+    assert 1.2 * right_angles < reached <= plant_bounds(settings, stated=False).uneven
+
+
+# ── the adversary's own law ──
 
 
 def test_the_adversary_s_law_is_the_paper_s() -> None:
-    """Against the other twin, which the project's law is compared with: states of any size, θ̂ beyond k_θ."""
-    rng, settings = np.random.default_rng(2), load_over(Settings(), ["law.inertia=[0.02, 0.03, 0.01]"])
-    loop, body = Loop(settings), body_of(with_theorem(settings).law)
-    q, q_d, (omega, omega_d, omega_d_dot, theta) = unit(rng, 4), unit(rng, 4), rng.standard_normal((4, ROWS, 3))
-    theta *= loop.k_theta * 1.02 / norm(theta)[:, None]
-    torques, z2 = loop.torque(q, omega, (q_d, omega_d, omega_d_dot), theta)
-    adapted = loop.adapted(theta, omega, z2)
-    for i in range(ROWS):
-        other = twin.law(body, q[i], omega[i], q_d[i], omega_d[i], omega_d_dot[i], theta[i], 1.0)
+    """Against the other twin, which the project's law is compared with, of any size and with θ̂ beyond k_θ."""
+    changes = ("law.inertia=[0.02, 0.03, 0.01]", "wire.actuators=3", "law.damping_estimate=[0, 0, 0]")
+    settings = load_over(Settings(), (*FREE, *swing("20, 40, 90", "0.3, 0.5, 0.2"), *changes))
+    rng, n = np.random.default_rng(2), 32
+    c = loop.rows_of([loop.constants(settings)])
+    body, path = body_of(settings.law), twin.Sinusoids(c.amplitude[0], c.frequency[0])  # type: ignore[arg-type]
+    q, omega, t = unit(rng.standard_normal((n, 4))), rng.standard_normal((n, 3)), rng.uniform(0, 100, n)
+    theta = unit(rng.standard_normal((n, 3))) * body.bound * 1.02
+    torques, z2, _ = loop.torque_of(c, q, omega, loop.desired(c, t), theta, 0 * omega)
+    adapted = loop.adapted(c, theta, omega, z2)
+    for i in range(n):
+        other = twin.law(body, q[i], omega[i], *path.desired(t[i]), theta[i], 1.0)
         assert torques[i] == pytest.approx(body.B @ other.u)
-        after = theta[i] + loop.period * other.theta_dot
+        after = theta[i] + settings.loop.period * other.theta_dot
         assert adapted[i] == pytest.approx(after * min(1, body.bound / 0.95 / norm(after)))

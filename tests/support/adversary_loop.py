@@ -1,0 +1,367 @@
+"""A second closed loop in NumPy, of many configurations at once, whose errors an adversary chooses.
+
+It takes numbers from a configuration, and nothing else of the project: body (C.1), (C.2), free or with a held roll; the
+paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag, encoders with their filter, a gyro;
+commands that are held, late or lost.
+
+At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the errors of sensors, the direction of τ_d and
+one of the commands that may be in force: each the one that pushes most along a costate of the linear error equations.
+
+Beside these it chooses θ, θ̂(t₀), the instant of the reference's first hundred days at which an experiment ends, and
+where it drives the error: first by what the reference does then, later as children of the worst experiments so far.
+
+Every row is an experiment. Constants `c` have shape (rows, 3), (rows, 1) or (rows, 3, 3), vectors (rows, 3), and
+quaternions (rows, 4) with the scalar first; the law also takes an axis of alternatives, (rows, n, 3).
+"""
+
+from __future__ import annotations
+
+from math import hypot
+from types import SimpleNamespace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+Array = npt.NDArray[np.float64]
+Motion = tuple[Array, ...]
+"""q_d, and ω_d and its derivative in the desired body frame."""
+QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|")
+VERTICAL: Final = np.array([0.0, 0.0, 1.0])
+END_S: Final = 100 * 86_400.0
+_AT_ONCE: Final = 1e-3
+"""Lag of rotors in the costates of a body without any [s]."""
+
+
+def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:
+    """The numbers of a configuration; `late` ticks that a command may be late, by lost frames or else by delay."""
+    law, wire, plant, sensors = settings.law, settings.wire, settings.plant, settings.plant.sensors
+    paper, held, real, nil = law.kind in ("adaptive", "nonadaptive"), wire.actuators == 2, not plant.ideal, np.zeros(3)
+    gyro, encoders = real and sensors.rate == "gyro", real and sensors.rate == "derivative"
+    return {
+        "J": law.inertia, "B": np.array(law.allocation) * [not held, 1, 1],
+        "B_inverse": np.linalg.inv(np.array(law.allocation)) * [[not held], [1], [1]],
+        "r_g": law.centre_of_mass, "weight": -law.mass * law.gravity * VERTICAL,
+        "C1": law.C1 if paper else nil, "C2": law.C2 if paper else nil, "kp": nil + 1 if paper else law.kp,
+        "kd": nil if paper else law.kd, "ki": law.ki if law.kind == "pid" else nil,
+        "share": law.C1 if paper else law.attitude_share if law.kind == "pid" else nil,
+        "Gamma": law.Gamma if law.kind == "adaptive" else nil, "adapts": [law.kind == "adaptive"],
+        "centre": law.damping_estimate, "radius": [law.damping_bound], "T": [settings.loop.period],
+        "delta_eps": [wire.attitude.quantizer().bound], "delta_u": [wire.voltage.quantizer().bound],
+        "delta_omega": [wire.rate.quantizer().bound + gyro * 6 * sensors.gyro_noise],
+        "bias": np.array(sensors.gyro_bias) * gyro,
+        "push": [disturbance + real * hypot(*plant.friction.coulomb)],
+        "up": [real * plant.rotor.lag_up_s], "down": [real * plant.rotor.lag_down_s], "held": [held],
+        "encoders": [encoders], "step": encoders * 2 * np.pi / np.array([np.inf, *sensors.counts]),
+        "bandwidth": [sensors.bandwidth], "ratio": [sensors.damping_ratio], "late": [late], "loss": [loss],
+        "amplitude": np.radians(settings.reference.amplitude), "frequency": settings.reference.frequency,
+    }  # fmt: skip
+
+
+def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
+    """Constants of experiments, so many of each configuration."""
+    together = {name: np.array([one[name] for one in known], dtype=float) for name in known[0]}
+    return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
+
+
+def cross(a: Array, b: Array) -> Array:
+    (x, y, z), (u, v, w) = ((each[..., 0], each[..., 1], each[..., 2]) for each in (a, b))
+    found: Array = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    return found
+
+
+def dot(a: Array, b: Array) -> Array:
+    product: Array = (a * b).sum(axis=-1, keepdims=True)
+    return product
+
+
+def norm(v: Array) -> Array:
+    length: Array = np.sqrt((v * v).sum(axis=-1))
+    return length
+
+
+def unit(v: Array) -> Array:
+    direction: Array = v / np.maximum(norm(v)[..., None], 1e-300)
+    return direction
+
+
+def by(matrix: Array, v: Array) -> Array:
+    product: Array = np.einsum("rij,rj->ri", matrix, v)
+    return product
+
+
+def to_body(q: Array, v: Array) -> Array:
+    """Rᵀ(q) v."""
+    t = 2 * cross(q[..., 1:], v)
+    found: Array = v - q[..., :1] * t + cross(q[..., 1:], t)
+    return found
+
+
+def times(p: Array, q: Array) -> Array:
+    """p ∘ q."""
+    (a, b), (s, v) = (p[..., :1], p[..., 1:]), (q[..., :1], q[..., 1:])
+    return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
+
+
+def attitude_of(angle: Array) -> Array:
+    """q of roll, pitch and yaw, of which yaw turns first."""
+    (a, b, c), (r, p, y) = np.cos(angle / 2).T, np.sin(angle / 2).T
+    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
+
+
+def joints_of(q: Array) -> Array:
+    """0, pitch and yaw of a body whose roll is held."""
+    return 2 * np.stack([0 * q[:, 0], np.arctan2(q[:, 2], q[:, 0]), np.arctan2(q[:, 3], q[:, 0])], axis=1)
+
+
+def desired(c: Any, t: Array) -> Motion:
+    """The reference at times t, one a row."""
+    turn = c.frequency * t[:, None]
+    angle, rate = c.amplitude * np.sin(turn), c.amplitude * c.frequency * np.cos(turn)
+    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = angle.T, rate.T, (-(c.frequency**2) * angle).T
+    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
+    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
+    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=1)
+    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[:, 2], across_dot * cr - ddp * sr - dr * omega[:, 1]
+    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=1)
+
+
+def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
+    """η̃, ε̃, ω_e, and ω_d and its derivative seen from the body."""
+    e = times(now[0] * [1, -1, -1, -1], q)
+    omega_d = to_body(e, now[1])
+    return e[..., :1], e[..., 1:], omega - omega_d, omega_d, to_body(e, now[2])
+
+
+def drift(c: Any, q: Array, omega: Array) -> Array:
+    """Ψ: what the body turns by without command and damping."""
+    return cross(c.r_g, to_body(q, c.weight)) - cross(omega, c.J * omega)
+
+
+def torque_of(c: Any, q: Array, omega: Array, now: Motion, theta: Array, integral: Array) -> tuple[Array, ...]:
+    """B u, z₂ and the integral's rate: C₁ = C₂ = 0 leave PD and PID, k_d = k_i = 0 the paper's law."""
+    eta_e, eps_e, omega_e, omega_d, omega_d_dot = errors(q, omega, now)
+    z2 = omega_e + c.C1 * eps_e
+    alpha_dot = -c.C1 / 2 * (eta_e * omega_e + cross(eps_e, omega_e))
+    feedback = -c.kp * eps_e - c.C2 * z2 - c.kd * omega_e - c.ki * integral
+    ahead = omega * theta - drift(c, q, omega) - c.J * (cross(omega, omega_d) - omega_d_dot - alpha_dot)
+    return feedback + ahead, z2, omega_e + c.share * eps_e
+
+
+def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
+    """θ̂ a period later: projected, then clipped to the outer ball."""
+    moved, tau, outer = theta - c.centre, -c.Gamma * omega * z2, c.radius / 0.95
+    passed, outward = (dot(moved, moved) - c.radius**2) / (outer**2 - c.radius**2), dot(moved, tau)
+    along = c.Gamma * moved / np.maximum(dot(moved, c.Gamma * moved), 1e-300)
+    moved = moved + c.T * (tau - (passed > 0) * (outward > 0) * np.minimum(passed, 1) * outward * along)
+    after: Array = c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300))
+    return after
+
+
+def rotor_lag(c: Any, V: Array, u: Array) -> Array:
+    """Each rotor's time constant now [s]."""
+    lag: Array = np.where((u - V) * V >= 0, c.up, c.down)
+    return lag
+
+
+def held_axis(q: Array) -> Array:
+    """The axis that is at right angles to the body's y and to the vertical."""
+    up = to_body(q, VERTICAL)
+    return np.stack([up[:, 2], 0 * up[:, 1], -up[:, 0]], axis=1)
+
+
+class State(NamedTuple):
+    """q, ω and the rotors' voltages; θ̂ and the integral; angles and rates as the encoders' filter has them."""
+
+    q: Array
+    omega: Array
+    V: Array
+    theta: Array
+    integral: Array
+    angle: Array
+    rate: Array
+
+
+def advance(c: Any, x: State, u: Array, theta: Array, push: Array) -> State:
+    """Body and rotors after a period, by one Runge–Kutta step."""
+    half = np.exp(-c.T / 2 / np.maximum(rotor_lag(c, x.V, u), 1e-9))
+    V = [u + (x.V - u) * (c.up > 0), u + (x.V - u) * half, u + (x.V - u) * half**2]
+    torques = [push + by(c.B, each) for each in V]
+
+    def slope(q: Array, omega: Array, torque: Array) -> tuple[Array, Array]:
+        q_dot = np.concatenate([-dot(q[:, 1:], omega), q[:, :1] * omega + cross(q[:, 1:], omega)], axis=1) / 2
+        omega_dot = (drift(c, q, omega) - theta * omega + torque) / c.J
+        n = held_axis(q)  # along it a mechanism's torque keeps n·ω = 0
+        n_dot = omega[:, 1:2] * np.stack([-n[:, 2], n[:, 1], n[:, 0]], axis=1)
+        return q_dot, omega_dot - c.held * (dot(n, omega_dot) + dot(n_dot, omega)) / dot(n, n / c.J) * n / c.J
+
+    h, q, omega = c.T, x.q, x.omega
+    k1, a1 = slope(q, omega, torques[0])
+    k2, a2 = slope(q + h / 2 * k1, omega + h / 2 * a1, torques[1])
+    k3, a3 = slope(q + h / 2 * k2, omega + h / 2 * a2, torques[1])
+    k4, a4 = slope(q + h * k3, omega + h * a3, torques[2])
+    q = unit(q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    return x._replace(q=q, omega=omega + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4), V=V[2])
+
+
+def in_balance(c: Any, now: Motion, theta: Array, theta_hat: Array, start: Array) -> State:
+    """The state in which the feedback balances the slow torque, moved by `start` in (ε̃, z₂); shape (rows, 6)."""
+    slow = -now[1] * (theta - theta_hat)
+    eps = np.where(c.ki > 0, 0, slow / (c.kp + c.C1 * c.C2)) + start[:, :3]
+    e = np.concatenate([np.sqrt(1 - dot(eps, eps)), eps], axis=1)
+    q, omega = times(now[0], e), start[:, 3:] - c.share * start[:, :3] + to_body(e, now[1])
+    joints = joints_of(q)
+    q, n = np.where(c.held, attitude_of(joints), q), held_axis(q)
+    omega = omega - c.held * dot(n, omega) * n
+    rate = omega / np.cos(joints[:, 1:2] * [0, 0, 1])
+    integral = np.where(c.ki > 0, slow / np.maximum(c.ki, 1e-9), 0)
+    V = by(c.B_inverse, torque_of(c, q, omega, now, theta_hat, integral)[0])
+    return State(q, omega, V, theta_hat, integral, joints - 2 * c.ratio / c.bandwidth * rate, rate)
+
+
+def seen(c: Any, x: State, joints: Array, F: Array) -> tuple[Array, Array, State]:
+    """q and ω as the sensors have them before quantization, where encoders count these joint angles."""
+    gap = x.angle - joints
+    x = x._replace(
+        angle=joints + F[..., 0, 0] * gap + F[..., 0, 1] * x.rate, rate=F[..., 1, 0] * gap + F[..., 1, 1] * x.rate
+    )
+    sine, cosine = np.sin(joints[:, 1]), np.cos(joints[:, 1])
+    omega = np.stack([-sine * x.rate[:, 2], x.rate[:, 1], cosine * x.rate[:, 2]], axis=1)
+    return np.where(c.encoders, attitude_of(joints), x.q), np.where(c.encoders, omega, x.omega + c.bias), x
+
+
+def filter_matrix(c: Any) -> Array:
+    """Of the encoders' filter, for how far its angle is from a held one, and its rate. Shape (rows, 2, 2)."""
+    w, zeta = c.bandwidth[:, 0], c.ratio[:, 0]
+    return np.stack([np.stack([0 * w, 0 * w + 1], axis=1), np.stack([-(w**2), -2 * zeta * w], axis=1)], axis=1)
+
+
+def costates(c: Any, target: Array, ticks: int) -> Array:
+    """∂(target · (ε̃, ω_e) at the end)/∂x at each tick. Shape (ticks + 1, 6, rows, 3).
+
+    x of an axis: ε̃, ω_e, the integral, angle and rate of the encoders' filter, the torque of the rotors.
+    """
+    A = np.zeros((*c.J.shape, 6, 6))
+    lag, stiff, damp = (
+        np.maximum((c.up + c.down) / 2, _AT_ONCE),
+        c.kp + c.C1 * c.C2,
+        c.C2 + c.kd + c.J * c.C1 / 2 - c.centre,
+    )
+    feedback = np.stack([-stiff, -damp * (1 - c.encoders), -c.ki, 0 * damp, -damp * c.encoders, 0 * damp], axis=-1)
+    rotors = (c.up > 0)[..., None]
+    A[..., 0, 1], A[..., 3, 4] = 0.5, 1.0
+    A[..., 1, :] = np.where(rotors, np.eye(6)[5], feedback) / c.J[..., None]
+    A[..., 1, 1] -= c.centre / c.J
+    A[..., 2, 0], A[..., 2, 1], A[..., 2, 2] = c.share * (c.ki > 0), c.ki > 0, -1.0 * (c.ki == 0)
+    A[..., 4, 0], A[..., 4, 3], A[..., 4, 4] = 2 * c.bandwidth**2, -(c.bandwidth**2), -2 * c.ratio * c.bandwidth
+    A[..., 5, :] = (feedback - np.eye(6)[5]) / lag[..., None]
+    # Rows of the same configuration follow each other and share A.
+    first = np.unique(c.case, return_index=True)[1]
+    step = np.swapaxes(expm(A[first] * c.T[first, :, None, None]), -1, -2)
+    found = np.zeros((ticks + 1, len(first), 3, 6, len(target) // len(first)))
+    found[ticks, :, :, :2] = target.reshape(len(first), -1, 2, 3).transpose(0, 3, 2, 1)
+    for i in reversed(range(ticks)):
+        found[i] = step @ found[i + 1]
+    return found.transpose(0, 3, 1, 4, 2).reshape(ticks + 1, 6, len(target), 3)
+
+
+def run(
+    c: Any, end: Array, theta: Array, theta_hat: Array, target: Array, start: Array, ticks: int
+) -> tuple[Array, Array]:
+    """All experiments, until the reference's time `end`, with `target` over (ε̃, ω_e) to be as large as can be then.
+
+    Returns:
+        The largest of each of QUANTITIES, shape (rows, 6); and the target that each would have there, (rows, 6, 6).
+    """
+    rows, p = np.arange(len(end)), costates(c, target, ticks)
+    wide = SimpleNamespace(**{name: each[:, None] for name, each in vars(c).items()})
+    alone = np.concatenate([np.zeros((1, 6)), np.identity(6)])[None]
+    F = expm(filter_matrix(c) * c.T[..., None])[:, None]
+    x = in_balance(c, desired(c, end - ticks * c.T[:, 0]), theta, theta_hat, start)
+    commands, in_force, lost_before = [x.V] * (int(c.late.max()) + 1), 0 * rows, 0 * rows
+    best, where, nil = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6)), np.zeros((len(rows), 3))
+    for i in range(ticks):
+        now, costate = desired(c, end - (ticks - i) * c.T[:, 0]), p[i + 1]
+        eta_e, eps_e, omega_e, *_ = errors(x.q, x.omega, now)
+        z2, omega, eps = omega_e + c.share * eps_e, x.omega, x.q[:, 1:]
+        push = np.where(c.up > 0, costate[5] / np.maximum(c.up, _AT_ONCE), costate[1] / c.J)
+
+        # Errors of encoders, then vertices of the quantizers: each sign by what that error alone does.
+        gain = costate[3] * (1 - F[..., 0, 0]) - costate[4] * F[..., 1, 0] - c.T * push * c.kp / 2
+        q_seen, omega_seen, x = seen(c, x, joints_of(x.q) + c.step / 2 * np.sign(gain), F)
+
+        def received(signs: Array, q: Array = q_seen, omega: Array = omega_seen) -> tuple[Array, Array]:
+            eps_Q = q[:, None, 1:] + wide.delta_eps * signs[..., :3]
+            rest = np.sqrt(np.maximum(0.0, 1 - dot(eps_Q, eps_Q)))
+            q_Q = np.concatenate([np.where(q[:, None, :1] < 0, -rest, rest), eps_Q], axis=2)
+            return unit(q_Q), omega[:, None] + wide.delta_omega * signs[..., 3:]
+
+        motion, theta_hat, integral = tuple(part[:, None] for part in now), x.theta[:, None], x.integral[:, None]
+        torques, _, rates = torque_of(wide, *received(alone), motion, theta_hat, integral)
+        score = dot(torques, push[:, None]) + dot(rates, (costate[2] * (c.ki > 0))[:, None])
+        q_Q, omega_Q = received(np.sign(score[:, 1:, 0] - score[:, :1, 0])[:, None])
+        torque, z2_Q, rate = (found[:, 0] for found in torque_of(wide, q_Q, omega_Q, motion, theta_hat, integral))
+        u, per_volt = by(c.B_inverse, torque), by(c.B.swapaxes(1, 2), push)
+
+        # A measurement that is lost gives no command, no step of θ̂ and none of the integral.
+        lost = c.loss[:, 0] * (dot(rate, costate[2])[:, 0] <= 0) * (lost_before < c.late[:, 0]) > 0
+        lost_before = np.where(lost, lost_before + 1, 0)
+        after = adapted(c, x.theta, omega_Q[:, 0], z2_Q), x.integral + c.T * rate * (c.ki > 0)
+        theta_hat, integral = (
+            np.where(lost[:, None], old, new) for old, new in zip((x.theta, x.integral), after, strict=True)
+        )
+        commands = [*commands[1:], np.where(lost[:, None], commands[-1], u + c.delta_u * np.sign(per_volt))]
+        ages = np.arange(len(commands))[::-1, None]
+        allowed = (ages <= (c.late * (1 - c.loss))[:, 0]) & ((i - ages >= in_force) | (ages == 0))
+        chosen = np.where(allowed, (np.array(commands) * per_volt).sum(axis=2), -np.inf).argmax(axis=0)
+        in_force = i - ages[chosen, 0]
+        x = x._replace(theta=theta_hat, integral=integral)
+        x = advance(c, x, np.array(commands)[chosen, rows], theta, c.push * unit(costate[1] / c.J))
+
+        z, volts = np.sqrt((1 - eta_e[:, 0]) ** 2 + norm(eps_e) ** 2 + norm(z2) ** 2), np.abs(u)
+        most = [norm(omega_e), np.abs(omega).max(1), np.abs(eps).max(1), volts.max(1)]
+        found = np.stack([z, norm(eps_e), *most], axis=1)
+        axis, motor = np.identity(3)[np.abs(omega).argmax(1)] * np.sign(omega), volts.argmax(1)
+        volt = -c.B_inverse[rows, motor] * np.sign(u[rows, motor])[:, None]
+        towards = (eps_e + c.share * z2, z2), (eps_e, nil), (nil, omega_e), (nil, axis), (eps_e, nil)
+        volt_target = volt * (c.kp + c.C1 * c.C2), volt * (c.C2 + c.kd)
+        targets = np.stack([np.concatenate(each, axis=1) for each in (*towards, volt_target)], axis=1)
+        better = found > best
+        best, where = np.where(better, found, best), np.where(better[..., None], targets, where)
+    return best, where
+
+
+def worst(known: list[dict[str, Any]], rows: int, generations: int, ticks: int) -> Array:
+    """The largest of each of QUANTITIES that the adversary reaches in each configuration, of these `constants`.
+
+    Beside the constants, `start` is the largest ‖x(t₀)‖ and `case` the configuration's number. Shape (cases, 6).
+    """
+    rng, cases, total = np.random.default_rng(1), len(known), len(known) * rows
+    c = rows_of(known, rows)
+
+    # Ends at which the reference turns fastest about an axis, or changes that most, or anywhere; θ̃ against it.
+    ends = rng.uniform(0, END_S, (300, total))
+    moves = np.abs([desired(c, t)[1:] for t in ends]).max(axis=3)
+    kind = np.arange(total) % 4
+    pick = np.where(kind < 2, moves[:, 0].argmax(axis=0), moves[:, 1].argmax(axis=0)) * (kind < 3)
+    end = ends[pick, np.arange(total)]
+    rates = desired(c, end)[1]
+    theta = np.identity(3)[np.abs(rates).argmax(axis=1)] * rng.choice([-1.0, 1.0], (total, 1))
+    theta[::3] = unit(rng.standard_normal((total, 3)))[::3]
+    estimate, best = -theta, np.zeros((cases, len(QUANTITIES)))
+    target = np.tile(unit(-rates * theta), 2) + 0.3 * rng.standard_normal((total, 6))
+    for _ in range(generations):
+        theta, estimate, start = unit(theta), unit(estimate), c.start * unit(rng.standard_normal((total, 6)))
+        first = c.centre + c.adapts * c.radius / 0.95 * estimate
+        reached, where = run(c, end, c.centre + c.radius * theta, first, unit(target), start, ticks)
+        found = reached.reshape(cases, rows, -1)
+        best = np.maximum(best, found.max(axis=1))
+        # Children of the worst three experiments for one of the quantities, half of them for ‖z‖.
+        quantity, group = np.resize([0, 1, 0, 2, 3, 0, 5, 0], rows), np.arange(cases)[:, None]
+        order = np.argsort(-found, axis=1)[group, rng.integers(0, 3, (cases, rows)), quantity]
+        parent = (order + group * rows).ravel()
+        target = unit(where[parent, np.tile(quantity, cases)]) + 0.1 * rng.standard_normal((total, 6))
+        end = end[parent] + rng.choice([0, 0.3, 2], total) * rng.standard_normal(total)
+        theta, estimate = (each[parent] + 0.15 * rng.standard_normal((total, 3)) for each in (theta, estimate))
+    return best
