@@ -51,8 +51,8 @@ def certificate_sheets(certificate: Certificate | OwnCertificate, verbose: bool 
         ],
     )
     if certificate.delay_ms is not None:
-        late = f"{certificate.delay_ms:.1f} ms of further delay, or {certificate.lost_frames} frames lost in a row"
-        yield f"It still holds with {late}.", []
+        lost = "" if certificate.lost_frames is None else f", or {certificate.lost_frames} frames lost in a row"
+        yield f"It still holds with {certificate.delay_ms:.1f} ms of further delay{lost}.", []
     yield "\n  ".join(["Assumed:", *certificate.assumptions]), []
     yield (
         "",

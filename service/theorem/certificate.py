@@ -75,7 +75,8 @@ class Certificate(BaseModel):
         description="largest further delay of commands with which it still holds [ms]; null where it does not hold"
     )
     lost_frames: int | None = Field(
-        description="most frames lost in a row, if none is delayed, with which it still holds; null likewise"
+        description="most frames lost in a row, if none is late, with which it still holds; null likewise, and of a "
+        "law with an integral, which does not advance without a measurement"
     )
     assumptions: list[str] = Field(description="what is assumed, each with the key or the option that states it")
     violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
@@ -245,7 +246,7 @@ def certify(
         settings: The configuration.
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
-        late_s: Further age of a command, by delay or lost frames [s].
+        late_s: Further age of a command, by delay, or by lost frames where the law has no integral [s].
         margins: Search delay_ms and lost_frames, too.
 
     Raises:
@@ -271,7 +272,7 @@ def certify(
         plant_deg=_degrees(e.plant_reach),
         constant_radius=_radius(constant),
         delay_ms=None if delay is None else floor(delay * 1e5) / 100,
-        lost_frames=None if delay is None else floor(delay / settings.loop.period),
+        lost_frames=None if delay is None or any(law.ki) else floor(delay / settings.loop.period),
         assumptions=_assumptions(settings, e, disturbance),
         violated=violated,
         terms=[*(term for part in e.paper or () for term in _terms(part)), *_reach_terms(e.plant_reach)],
@@ -375,7 +376,11 @@ def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) ->
         f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)",
         *paper,
         "a state near enough to the set, once, and for the age of a command before",
-        *(["the integral in balance then"] if any(law.ki) else []),
+        *(
+            ["the integral in balance then, and no measurement lost: without one it does not advance"]
+            if any(law.ki)
+            else []
+        ),
         "the reference itself is followed: no approach to it is certified, at a start or after an operator's change",
         "the law's J, B, m and r_g are the plant's ([law])",
         *(["the attitude that it finds and holds is level (reference.attitude)"] if found else []),

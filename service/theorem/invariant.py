@@ -275,9 +275,10 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     if p.tilt is not None:
         fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
     d4 = delta_omega_e + share * delta_q + p.period * (omega_e_dot + share * at["eps_dot"])
-    gap = at["gap"] + p.lag * rest_dot + 2 * noise + steady * p.encoder.ripple
+    hold += ki * p.encoder.angle  # an integral of the encoders' ripple is that angle
+    gap = at["gap"] + p.lag * rest_dot + 2 * noise + hold + steady * p.encoder.ripple
     gap += 2 * steady * p.encoder.angle / p.lag if p.lag else 0.0
-    d5 = noise + ki * p.encoder.angle + hold + p.uneven * gap
+    d5 = noise + hold + p.uneven * gap
     deviation = (
         at["feedback"] + slow + noise + law.coulomb + steady * p.encoder.ripple + law.estimate * axis_omega
         + p.weight * 2 * eps_e + spread * omega**2 + alpha * zeta * omega_e

@@ -195,7 +195,7 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert {key: running.of(key) for key in published} == published
         assert running.losses() == []
         assert descriptions(parts(running.path)[-1])[DESCRIPTION] == published[DESCRIPTION][0]
-        assert len(running.of("/aero/pose")) == pytest.approx(10, abs=1)  # of a second
+        assert 0 < len(running.of("/aero/pose")) <= 11  # of a second; rows before the description are not decoded
 
 
 def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
