@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
+    from aeroloop.service.terminal.show import Sheets
     from aeroloop.service.vehicle_address import VehicleAddress
 
 log: Final = logging.getLogger("aeroloop")
@@ -152,12 +153,23 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
         fail(problem(error, *models) if isinstance(error, ValidationError) else str(error), 2)
 
 
-def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
-    """Print a result, as JSON or by a function that prints it for a person."""
+@contextmanager
+def working(title: str, json: bool, total: float | None = None) -> Iterator[Callable[..., None]]:
+    """As `guarded`, with a progress bar: `update(done, total)`. No bar where JSON is printed."""
+    from aeroloop.service.terminal.display import progress_bar
+
+    with guarded(), progress_bar(title, total, hidden=json) as update:
+        yield update
+
+
+def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdown: bool = False, keys: int = 1) -> None:
+    """Print a result: all of it as JSON, or the tables that a function makes of it."""
     if json:
         typer.echo(result.model_dump_json(indent=2))
     else:
-        table(result)
+        from aeroloop.service.terminal.show import show_all
+
+        show_all(sheets(result), "markdown" if markdown else "terminal", keys)
 
 
 def check_engine(engine: str) -> None:

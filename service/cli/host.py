@@ -7,7 +7,17 @@ from typing import Annotated, Final
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, address_of, checked, guarded, settings_of
+from aeroloop.service.cli.common import (
+    Config,
+    Json,
+    Overrides,
+    address_of,
+    checked,
+    guarded,
+    settings_of,
+    show,
+    working,
+)
 
 DEFAULT_KEYS: Final = Path("~/.config/aeroloop/keys")
 """Directory where none is configured."""
@@ -39,17 +49,12 @@ def doctor(
     """Check whether this machine holds the configured rate. Checks its certificates, too, and prints what to change."""
     settings = settings_of(config, overrides)
     from aeroloop.service.host.doctor import CHECK_S, diagnose
-    from aeroloop.service.terminal.display import progress_bar
-    from aeroloop.service.terminal.sheets import MARKS, diagnosis_sheets
-    from aeroloop.service.terminal.show import show_all
+    from aeroloop.service.terminal.sheets import diagnosis_sheets
 
-    with guarded(), progress_bar("check", CHECK_S, hidden=json) as update:
+    with working("check", json, CHECK_S) as update:
         tried = settings.network if network else None
         diagnosis = diagnose(settings.loop, update, settings.network.security.folder, tried)
-    if json:
-        typer.echo(diagnosis.model_dump_json(indent=2))
-    else:
-        show_all(diagnosis_sheets(diagnosis), keys=2, styles=MARKS)
+    show(diagnosis, json, diagnosis_sheets, keys=2)
     if not diagnosis.holds:
         raise typer.Exit(1)
 
@@ -139,10 +144,10 @@ def show_keys(
 
         typer.echo(dumps([file.model_dump(mode="json") for file in files], indent=2))
     else:
-        from aeroloop.service.terminal.sheets import MARKS, key_sheets
+        from aeroloop.service.terminal.sheets import key_sheets
         from aeroloop.service.terminal.show import show_all
 
-        show_all(key_sheets(str(folder), files), keys=2, styles=MARKS)
+        show_all(key_sheets(str(folder), files), keys=2)
     if any(file.problem for file in files):
         raise typer.Exit(1)
 

@@ -27,6 +27,7 @@ from aeroloop.service.cli.common import (
     new_file,
     show,
     with_bits_of,
+    working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
 
@@ -74,11 +75,11 @@ def experiment(
     """Run the closed loop in this process, in lockstep, without a network."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.lab.experiment import run_experiment
-    from aeroloop.service.terminal.display import figures_table, progress_bar
+    from aeroloop.service.terminal.log_sheets import figure_sheets
 
-    with guarded(), progress_bar("experiment", duration, hidden=json) as update:
+    with working("experiment", json, duration) as update:
         figures = run_experiment(settings, duration, update)
-    show(figures, json, figures_table)
+    show(figures, json, figure_sheets)
 
 
 def tables(
@@ -93,24 +94,20 @@ def tables(
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.tables import predict, sheets
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
-    with guarded(), count_bar("cells", hidden=json) as update:
+    with working("cells", json) as update:
         result = predict(settings, seeds, update, engine)
-    show_result(result, sheets, json=json, markdown=markdown)
+    show(result, json, sheets, markdown)
 
 
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
     settings = loop_of(config, overrides)
     from aeroloop.service.lab.tables import calibrate, calibration_sheets
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
-    with guarded(), count_bar("experiments", hidden=json) as update:
-        result = calibrate(settings, lambda runs: update(runs, None))
-    show_result(result, calibration_sheets, json=json)
+    with working("experiments", json) as update:
+        result = calibrate(settings, update)
+    show(result, json, calibration_sheets)
 
 
 def certify(
@@ -144,12 +141,11 @@ def certify(
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.terminal.show import show_result
     from aeroloop.service.theorem.any_law import certify_any
 
     with guarded():
         result = certify_any(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
-    show_result(result, partial(certificate_sheets, verbose=verbose), json=json)
+    show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 
 
@@ -178,15 +174,13 @@ def burden(
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
     with checked():
         check_figure(figure, config, force)
         cells = grid(settings, bits or (), quantizer or (), sensors or ())
-    with guarded(), count_bar("experiments", hidden=json) as update:
+    with working("experiments", json) as update:
         result = measure_burden(settings, cells, duration, update, engine)
-    show_result(result, sheets, json=json, markdown=markdown, keys=2)
+    show(result, json, sheets, markdown, keys=2)
     if figure is not None:
         with new_file(figure, config, force) as part:
             draw_burden(result, part)
@@ -238,8 +232,6 @@ def laws(
     check_engine(engine)
     from aeroloop.service.lab.laws import compare, draw_laws, run_comparison, sheets
     from aeroloop.service.lab.sweep import check_table
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
     axes = {"laws": law, "bits": bits, "sensors": sensors, "winds": wind, "plants": plant}
     given = {name: values or () for name, values in axes.items()}
@@ -248,9 +240,9 @@ def laws(
         comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
         if out is not None:
             check_table(out, comparison.plan, [config], force=force, within_deg=within)
-    with guarded(), count_bar("experiments and searches", hidden=json) as update:
+    with working("experiments and searches", json) as update:
         result = run_comparison(comparison, out, engine, update)
-    show_result(result, sheets, json=json, markdown=markdown)
+    show(result, json, sheets, markdown)
     if figure is not None:
         with new_file(figure, config, force) as part:
             draw_laws(result, part)
@@ -280,16 +272,14 @@ def sweep(
     check_engine(engine)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
     with checked():
         axes = parse_axes(vary or ())
         planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
         check_table(out, planned, [config], force=force)
-    with guarded(), count_bar("experiments", hidden=json) as update:
+    with working("experiments", json) as update:
         result = run_sweep(planned, out, engine=engine, progress=update)
-    show_result(result, sheets, json=json)
+    show(result, json, sheets)
 
 
 def tune(
@@ -351,8 +341,6 @@ def tune(
     from aeroloop.service.lab.sweep import open_workers
     from aeroloop.service.lab.tune import TuneOptions, parse_winds, sheets, toml_of, tune
     from aeroloop.service.logs.outputs import check_output
-    from aeroloop.service.terminal.display import count_bar
-    from aeroloop.service.terminal.show import show_result
 
     with checked():
         if out is not None:
@@ -361,9 +349,9 @@ def tune(
             gain or (), scale, weight, max_saturated, max_chatter, seeds, parse_winds(winds), held_out, budget,
             duration, reach, seed, within,
         )  # fmt: skip
-    with guarded(), count_bar("experiments", hidden=json) as update, open_workers(engine) as workers:
+    with working("experiments", json) as update, open_workers(engine) as workers:
         found = tune(settings, options, workers, update)
-    show_result(found, sheets, json=json)
+    show(found, json, sheets)
     if out is not None:
         with new_file(out, config, force) as part:
             part.write_text(toml_of(found), encoding="utf-8")

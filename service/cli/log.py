@@ -21,6 +21,7 @@ from aeroloop.service.cli.common import (
     run_alone,
     settings_of,
     show,
+    working,
 )
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.recover import Recovery
     from aeroloop.service.review.report import Report
+    from aeroloop.service.terminal.show import Sheets
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
 Html = Annotated[
@@ -72,12 +74,12 @@ def review(
 
     from aeroloop.service.logs.outputs import writing_into
     from aeroloop.service.review.review import read
-    from aeroloop.service.terminal.display import share_bar
-    from aeroloop.service.terminal.log_tables import review_account
+    from aeroloop.service.terminal.display import progress_bar
+    from aeroloop.service.terminal.log_sheets import review_sheets
 
     _check_part(since_s, until_s, "--to")
     with guarded():
-        with share_bar("reading", hidden=json) as update:
+        with progress_bar("reading", 1, hidden=json) as update:
             judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
         if figures is not None:
             from aeroloop.service.report.plots import draw_figures
@@ -89,7 +91,7 @@ def review(
         if html is not None:
             write_html([judged.report(limits)], html, logs, force)
     findings = judged.checked(limits)
-    show(findings, json, review_account)
+    show(findings, json, review_sheets)
     if broken := broken_limits(findings):
         fail("; ".join(broken), 1)
 
@@ -112,15 +114,15 @@ def compare(
     _check_page(html, logs, force)
 
     from aeroloop.service.review.compare import Comparison, read_runs
-    from aeroloop.service.terminal.display import share_bar
-    from aeroloop.service.terminal.log_tables import comparison_tables
+    from aeroloop.service.terminal.display import progress_bar
+    from aeroloop.service.terminal.log_sheets import comparison_sheets
 
     with guarded():
-        with share_bar("reading", hidden=json) as update:
+        with progress_bar("reading", 1, hidden=json) as update:
             reports = read_runs(logs, limits, update)
         if html is not None:
             write_html(reports, html, logs, force)
-    show(Comparison.of(reports), json, lambda _: comparison_tables(reports))
+    show(Comparison.of(reports), json, lambda _: comparison_sheets(reports))
     if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
 
@@ -166,13 +168,12 @@ def replay(
     """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
     from aeroloop.protocol.messages.trace import ENDS
     from aeroloop.service.logs.replay import replay
-    from aeroloop.service.terminal.display import share_bar
-    from aeroloop.service.terminal.log_tables import replay_table
+    from aeroloop.service.terminal.log_sheets import replay_sheets
 
     _check_part(since_s, until_s, "--to")
-    with guarded(), share_bar("replaying", hidden=json) as update:
+    with working("replaying", json, 1) as update:
         replayed = replay(logs, overrides or [], update, [end] if end else ENDS, since_s, until_s)
-    show(replayed, json, replay_table)
+    show(replayed, json, replay_sheets)
     if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)
 
@@ -186,16 +187,14 @@ def recover(
 ) -> None:
     """Copy what is whole of a broken log into a new one. Reports what was lost."""
     from aeroloop.service.logs.recover import recover
-    from aeroloop.service.terminal.display import share_bar
 
-    def account(recovery: Recovery) -> None:
-        typer.echo(f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels")
-        for line in recovery.lost:
-            typer.echo(f"not recovered, {line}")
+    def sheets(recovery: Recovery) -> Sheets:
+        found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"
+        yield "\n".join([found, *(f"not recovered, {line}" for line in recovery.lost)]), []
 
-    with guarded(), share_bar("recovering", hidden=json) as update:
+    with working("recovering", json, 1) as update:
         recovery = recover(broken, out, update, force=force)
-    show(recovery, json, account)
+    show(recovery, json, sheets)
 
 
 @group.command()
@@ -244,20 +243,17 @@ def export(
 ) -> None:
     """Write a log as a table with a row for each tick. With --to mcap: a log with every message decoded."""
     from aeroloop.service.logs.export import export
-    from aeroloop.service.terminal.display import share_bar
 
-    def account(exported: Exported) -> None:
+    def sheets(exported: Exported) -> Sheets:
         if exported.sessions is None:
-            typer.echo(f"{exported.out}: {exported.rows} messages on {len(exported.columns)} channels")
+            found = f"{exported.rows} messages on {len(exported.columns)} channels"
         else:
-            typer.echo(f"{exported.out}: {exported.rows} ticks of {', '.join(exported.sessions)}")
-        for line in exported.damages:
-            typer.echo(f"not read, {line}")
-        for one in exported.unknown:
-            typer.echo(str(one))
+            found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
+        damages = [f"not read, {line}" for line in exported.damages]
+        yield "\n".join([f"{exported.out}: {found}", *damages, *map(str, exported.unknown)]), []
 
     _check_part(since_s, until_s, "--until")
-    with guarded(), share_bar("exporting", hidden=json) as update:
+    with working("exporting", json, 1) as update:
         exported = export(
             logs,
             to,
@@ -269,4 +265,4 @@ def export(
             force=force,
             progress=update,
         )
-    show(exported, json, account)
+    show(exported, json, sheets)

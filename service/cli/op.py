@@ -67,9 +67,10 @@ def status(
             tree = {"well": well, "troubles": [trouble._asdict() for trouble in troubles(found)], "vehicles": tree}
         typer.echo(dumps(tree, indent=2))
     else:
-        from aeroloop.service.terminal.roles import status_view, troubles_view
+        from aeroloop.service.terminal.roles import status_sheets, trouble_sheets
+        from aeroloop.service.terminal.show import show_all
 
-        (troubles_view if check else status_view)(found)
+        show_all(trouble_sheets(found) if check else status_sheets(found))
     for line in [] if check else found.silent:
         typer.echo(f"aeroloop: {line}", err=True)
     if not well:

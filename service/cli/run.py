@@ -28,6 +28,7 @@ from aeroloop.service.cli.common import (
     settings_of,
     show,
     with_bits_of,
+    working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
 
@@ -69,18 +70,16 @@ def demo(
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
     settings = with_bits_of(loop_of(config, overrides, *options), bits_out, bits_in)
     from aeroloop.service.lab.demo import run_demo
-    from aeroloop.service.terminal.display import live_demo
-    from aeroloop.service.terminal.log_tables import demo_account
+    from aeroloop.service.terminal.display import demo_progress
+    from aeroloop.service.terminal.log_sheets import demo_sheets
 
-    with guarded():
-        if json or not sys.stderr.isatty():
-            how = "in lockstep" if settings.loop.lockstep else "in real time"
-            typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
-            figures, complete = run_demo(settings, duration, log)
-        else:
-            with live_demo(settings, duration) as update:
-                figures, complete = run_demo(settings, duration, log, update)
-    show(figures, json, demo_account)
+    hidden = json or not sys.stderr.isatty()
+    if hidden:
+        how = "in lockstep" if settings.loop.lockstep else "in real time"
+        typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
+    with working("starting", hidden, duration) as update:
+        figures, complete = run_demo(settings, duration, log, None if hidden else demo_progress(settings, update))
+    show(figures, json, demo_sheets)
     if not json:
         page = quote(str(Path(figures.log or "").with_suffix(".html")))
         typer.echo(f"aeroloop: next, draw it: `aeroloop log review {quote(figures.log or '')} --html {page}`", err=True)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from json import dumps
 from typing import Any, Final, Literal, NamedTuple
 
+from aeroloop.service.figures import Figures
 from aeroloop.service.review.report import Findings, Mark, Spread
 from aeroloop.service.review.requirements import value_of
 
@@ -148,7 +149,7 @@ FIGURES: Final = (
 )  # fmt: skip
 
 
-def figure_rows(runs: Sequence[Findings]) -> list[Row]:
+def figure_rows(runs: Sequence[Figures]) -> list[Row]:
     """Main figures, and every other that at least one run has or has a reason for lacking.
 
     Of the theorem's, `theorem_sentences` has the reasons.

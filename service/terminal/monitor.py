@@ -22,10 +22,8 @@ from typing import Final
 
 import zenoh
 from pydantic import ValidationError
-from rich.columns import Columns
 from rich.console import Console, Group
 from rich.live import Live
-from rich.text import Text
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status, Telemetry, Truth
@@ -33,7 +31,8 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle, to_euler
 from aeroloop.service.host.health import SILENT_S
-from aeroloop.service.terminal.roles import STALE, WAITING, duration, roles_view
+from aeroloop.service.terminal.roles import duration, role_sheets
+from aeroloop.service.terminal.show import drawn
 
 REFRESH_S: Final = 0.2
 EVENTS: Final = 5
@@ -83,38 +82,38 @@ class Top:
     def draw(self, width: int) -> Group:
         """The current view, for a terminal of this width."""
         with self._lock:
-            if not self._vehicles:
-                return Group(Text("no role on the network yet"))
-            now, blocks = self._clock(), list[Text | Columns | Group]()
+            now, blocks = self._clock(), list[Group]()
             for name, vehicle in sorted(self._vehicles.items()):
                 statuses = {role: (now - at, status) for role, (at, status) in vehicle.statuses.items()}
-                values = Columns(_values(vehicle, statuses, now), padding=(0, 3, 0, 0))
-                blocks += [Text(name, style="bold"), values, roles_view(statuses, width), Text("")]
-            return Group(*blocks, *(Text(event) for event in self._events))
+                values = "   ".join(_values(vehicle, statuses, now))
+                blocks += [drawn(rows, title, width) for title, rows in (*role_sheets(statuses, name), (values, []))]
+                blocks.append(drawn([], " ", width))
+            events = "\n".join(self._events) if blocks else "no role on the network yet"
+            return Group(*blocks, drawn([], events, width))
 
 
-def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[Text]:
+def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[str]:
     """Attitude, error and voltages, as far as they are those of now."""
     if vehicle.truth is not None:
         at, truth = vehicle.truth
         roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
         text = f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°"
-        yield Text(text) if now - at < SILENT_S else Text(f"no attitude for {duration(now - at)}", style=WAITING)
+        yield text if now - at < SILENT_S else f"no attitude for {duration(now - at)}"
     at, telemetry = vehicle.telemetry or (now, None)
     # The session that runs, by the plant, or by the controller where there is no plant.
     age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
     session = status.session if status is not None and age < SILENT_S else None
     if session is None:
         if statuses:
-            yield Text("no session: no error, no voltages", style=STALE)
+            yield "no session: no error, no voltages"
         return
     if telemetry is None or telemetry.session != session:
-        yield Text("no telemetry yet", style=WAITING)
+        yield "no telemetry yet"
     elif now - at >= SILENT_S:
-        yield Text(f"no telemetry for {duration(now - at)}", style=WAITING)
+        yield f"no telemetry for {duration(now - at)}"
     else:
-        yield Text(f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°")
-        yield Text("voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V")
+        yield f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°"
+        yield "voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V"
 
 
 def watch(network: NetworkSettings) -> None:

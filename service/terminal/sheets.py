@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, Quantizer, UniformQuantizer
-from aeroloop.service.terminal.show import Row
+from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
     from aeroloop.protocol.wire.spec import WireSpec
@@ -20,9 +20,6 @@ DECIDING: Final = (
     "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "τ_h of the plant"
 )  # fmt: skip
 """Symbols of a certificate's terms that are shown unless --verbose: what goes in, what decides, what comes out."""
-MARKS: Final = {"✓": "green", "✗": "bold red"}
-
-Sheets = Iterator[tuple[str, list[Row]]]
 
 
 def certificate_sheets(certificate: Certificate | OwnCertificate, verbose: bool = False) -> Sheets:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Final, Literal, TypeAlias, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, Literal, TypeAlias
 
 import typer
-from pydantic import BaseModel
 from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.table import Table
@@ -18,20 +18,20 @@ from rich.text import Text
 Row: TypeAlias = dict[str, str]
 Format: TypeAlias = Literal["terminal", "markdown", "csv", "json"]
 
-Result = TypeVar("Result", bound=BaseModel)
+Sheets: TypeAlias = Iterable[tuple[str, Sequence[Row]]]
+"""Tables, each with its title, and paragraphs, which are titles without rows."""
 
+STYLES: Final = {
+    **dict.fromkeys(("✓", "running", "driven", "recording", "routing"), "green"),
+    **dict.fromkeys(("✗", "tripped", "faulted", "fault", "not recording", "silent"), "bold red"),
+    **dict.fromkeys(("missing", "lost", "refused"), "yellow"),
+}
+"""In a terminal, of cells with these texts."""
 _PIPE_WIDTH: Final = 160
 _GAP: Final = 2
-NO_STYLES: Final[Mapping[str, str]] = {}
 
 
-def show(
-    rows: Sequence[Row],
-    title: str = "",
-    form: Format = "terminal",
-    keys: int = 1,
-    styles: Mapping[str, str] = NO_STYLES,
-) -> None:
+def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
     """Print rows, all with the same columns, and a title; without rows the title is a paragraph.
 
     Args:
@@ -39,7 +39,6 @@ def show(
         title: Above the table, in a terminal and in Markdown.
         form: One of four.
         keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
-        styles: In a terminal, of cells with these texts.
     """
     if form == "json":
         typer.echo(json.dumps(rows, ensure_ascii=False, indent=2))
@@ -53,38 +52,21 @@ def show(
         console = Console()
         if not console.is_terminal:
             console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
-        if title:
-            console.print(Text(title, style="italic" if rows else ""), soft_wrap=not console.is_terminal)
-        if rows:
-            console.print(table(rows, console.width, keys, styles))
+        console.print(drawn(rows, title, console.width, keys), soft_wrap=not console.is_terminal and not rows)
 
 
-def show_all(
-    sheets: Iterable[tuple[str, Sequence[Row]]],
-    form: Format = "terminal",
-    keys: int = 1,
-    styles: Mapping[str, str] = NO_STYLES,
-) -> None:
+def show_all(sheets: Sheets, form: Format = "terminal", keys: int = 1) -> None:
     """Print tables and paragraphs, with a line between them."""
     for i, (title, rows) in enumerate(sheets):
         if i:
             typer.echo("")
-        show(rows, title, form, keys, styles)
+        show(rows, title, form, keys)
 
 
-def show_result(
-    result: Result,
-    sheets: Callable[[Result], Iterable[tuple[str, Sequence[Row]]]],
-    *,
-    json: bool,
-    markdown: bool = False,
-    keys: int = 1,
-) -> None:
-    """Print a result of a command: all of it as JSON, or as the tables that a function makes of it."""
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    else:
-        show_all(sheets(result), "markdown" if markdown else "terminal", keys)
+def drawn(rows: Sequence[Row], title: str, width: int, keys: int = 1) -> Group:
+    """Rows as a table that is at most so wide: blocks of columns below each other where not all fit side by side."""
+    heading = [Text(title, style="bold" if rows else "")] if title else []
+    return Group(*heading, *(_blocks(rows, width, keys) if rows else ()))
 
 
 def _markdown(rows: Sequence[Row], title: str) -> list[str]:
@@ -97,20 +79,20 @@ def _markdown(rows: Sequence[Row], title: str) -> list[str]:
 
 
 def _right(rows: Sequence[Row]) -> list[bool]:
-    """Which columns hold numbers, and so stand to the right: never the first."""
+    """Which columns hold numbers, and no longer words, and so stand to the right: never the first."""
 
     def numbers(column: str) -> bool:
-        return all(any(map(str.isdigit, row[column])) for row in rows if row[column] not in ("–", "", "none"))
+        cells = [row[column] for row in rows if row[column] not in ("–", "", "none")]
+        return all(re.search(r"\d", cell) and not re.search(r"[^\W\d_]{4}", cell) for cell in cells)
 
     return [i > 0 and numbers(column) for i, column in enumerate(rows[0])]
 
 
-def table(rows: Sequence[Row], width: int, keys: int = 1, styles: Mapping[str, str] = NO_STYLES) -> Group:
-    """Rows as a table that is at most so wide: blocks of columns below each other where not all fit side by side."""
+def _blocks(rows: Sequence[Row], width: int, keys: int) -> list[Table]:
     least = {name: _least(rows, name, width) for name in rows[0]}
     right = dict(zip(rows[0], _right(rows), strict=True))
     tables = []
-    for columns in _blocks(least, width, keys):
+    for columns in _split(least, width, keys):
         drawn = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in columns}
         folds = sum(whole.values()) + _GAP * (len(columns) - 1) > width
@@ -119,9 +101,9 @@ def table(rows: Sequence[Row], width: int, keys: int = 1, styles: Mapping[str, s
             fixed = least[name] if folds and not is_long else None
             drawn.add_column(name, justify="right" if right[name] else "left", width=fixed, min_width=least[name])
         for row in rows:
-            drawn.add_row(*(Text(row[name], style=styles.get(row[name], "")) for name in columns))
+            drawn.add_row(*(Text(row[name], style=STYLES.get(row[name], "")) for name in columns))
         tables.append(drawn)
-    return Group(*tables)
+    return tables
 
 
 def _least(rows: Sequence[Row], name: str, available: int) -> int:
@@ -132,7 +114,7 @@ def _least(rows: Sequence[Row], name: str, available: int) -> int:
     return max(map(cell_len, (*whole, *(word for text in (name, *folding) for word in text.split()), "")))
 
 
-def _blocks(least: Mapping[str, int], available: int, keys: int) -> list[list[str]]:
+def _split(least: Mapping[str, int], available: int, keys: int) -> list[list[str]]:
     """Columns of each block: all in one where they fit beside each other."""
     first, *others = [*least][:keys], *[*least][keys:]
     blocks = [[*first]]

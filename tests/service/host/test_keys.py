@@ -128,13 +128,14 @@ def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
     from datetime import UTC, datetime
 
     from aeroloop.service.host.operator import Gathered
-    from aeroloop.service.terminal.roles import status_view
+    from aeroloop.service.terminal.roles import status_sheets
+    from aeroloop.service.terminal.show import show_all
 
     until = datetime.now(UTC) + timedelta(days=days)
     status = Status(
         role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, certificate_until=until
     )  # fmt: skip
-    status_view(Gathered({"aero": {"plant": status}}, []))
+    show_all(status_sheets(Gathered({"aero": {"plant": status}}, [])))
     assert (f"expires at {until:%Y-%m-%d}" in capfd.readouterr().out) == said
 
 

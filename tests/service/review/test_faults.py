@@ -82,7 +82,7 @@ def test_review_and_demo_list_them_first_in_the_terminal_and_as_json(
     for command in (["log", "review", str(faulty)], ["demo"]):
         assert execute(command) == 0
         text = " ".join(capsys.readouterr().out.split())
-        assert text.index("with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s") < text.index(" duration ")
+        assert text.index("command:drop=0.3@0.2..0.6 0.200 s 0.600 s") < text.index(" z_track ")
         assert execute([*command, "--json"]) == 0
         faults = json.loads(capsys.readouterr().out)["faults"]
         assert [fault["source"] for fault in faults] == ["configured", "injected", "configured"]

@@ -19,7 +19,7 @@ from aeroloop.service.config import load
 from aeroloop.service.review.report import Check, Findings, Spread
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
-from aeroloop.service.terminal.log_tables import sparkline
+from aeroloop.service.terminal.log_sheets import sparkline
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, lockstep, make_log
@@ -253,8 +253,8 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
     assert "latency 300 µs 300 µs 300 µs 300 µs 300 µs" in out
-    assert out.startswith("0.410 s plant tripped the [red] limit 0 0.420 s plant tripped the [red] limit 1 0.500 s")
-    assert out.index("no 0 refused") < out.index("duration") < out.index("no 0 armed")
+    assert out.startswith("time role event what 0.410 s plant tripped the [red] limit 0 0.420 s plant tripped the [red] limit 1 0.500 s")
+    assert out.index("no 0 refused") < out.index(" z_track ") < out.index("no 0 armed")
     assert "plant refused no 0 refused (and 14 more like it, the last: 0.500 s)" in out
     assert "… and 4 more such events" in out  # beside what the session began with
     assert "✗ gaps ≤ 0 1" in out

@@ -101,7 +101,7 @@ def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
     page = tmp_path / "page.html"
     assert execute(["log", "review", str(log), "--session", "2", "--html", str(page)]) == 0
     out = " ".join(capfd.readouterr().out.split())
-    assert out.startswith("0.100 s plant tripped trip of s2 duration")
+    assert out.startswith("time role event what 0.100 s plant tripped trip of s2 figure value unit")
     assert out.index("duration") < out.index("before plant tripped trip of s1")
     assert "session s2 of aero" in out
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out

@@ -23,7 +23,8 @@ from aeroloop.service.review.report import Check, Findings, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
-from aeroloop.service.terminal.log_tables import review_account
+from aeroloop.service.terminal.log_sheets import review_sheets
+from aeroloop.service.terminal.show import show_all
 from aeroloop.service.theorem import any_law
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
@@ -325,7 +326,7 @@ def test_the_bound_is_drawn_until_gains_or_reference_change() -> None:
 def test_the_account_says_what_held_and_in_one_line_what_could_not_be_judged(
     logs: Logs, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    review_account(read(logs("ideal")).findings)
+    show_all(review_sheets(read(logs("ideal")).findings))
     said = " ".join(capfd.readouterr().out.split())
     assert "The certificate does not hold" in said
     assert "The run kept to Lemma 1." in said

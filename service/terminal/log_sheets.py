@@ -1,4 +1,4 @@
-"""Terminal tables of logs: the findings of a review, several runs side by side, the result of a replay."""
+"""Rows of logs for `show`: findings of a review, runs side by side, figures of one run, the result of a replay."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from collections.abc import Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Column, Table
-from rich.text import Text
-
+from aeroloop.service.figures import Figures
 from aeroloop.service.report import rows
 from aeroloop.service.report.rows import count, grave, missing
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, Spread, differences
-from aeroloop.service.terminal.display import figures_table, labelled
+from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
@@ -35,80 +31,76 @@ UNSEEN_SHOWN: Final = 3
 _BARS: Final = "▁▂▃▄▅▆▇█"
 
 
-def review_account(findings: Findings) -> None:
-    """Print the events that matter, figures of merit, timing, other events, and whether the limits hold."""
-    console = Console()
+def figure_sheets(figures: Figures) -> Sheets:
+    """Main figures of merit of one run, each that is missing with its reason; its trips, damages and log."""
+    yield "", _one_run(figures)
+    lines = [f"tripped: {trip}" for trip in figures.trips] + [f"not read: {line}" for line in figures.damages]
+    if lines := [*lines, *([f"log: {figures.log}"] if figures.log else [])]:
+        yield "\n".join(lines), []
+
+
+def demo_sheets(figures: DemoFigures) -> Sheets:
+    """The faults that acted, and the figures of merit."""
+    if figures.faults:
+        yield "with faults", [_fault(fault) for fault in figures.faults]
+    yield from figure_sheets(figures)
+
+
+def review_sheets(findings: Findings) -> Sheets:
+    """The events that matter, figures of merit, timing, other events, and whether the limits hold."""
     marks = timed(findings.marks)
     timed_faults = ("fault begins", "fault ends") if findings.faults else ()  # stand in a table of their own
     before = [entry for entry in marks if entry[0] == BEFORE]
     since = marks[len(before) :]
     matter = [entry for entry in since if grave(entry[1]) and not entry[1].text.startswith(timed_faults)]
-    none = "no trip, failure, loss or refusal"
-    console.print(_grave_table(matter) if matter else f"{none} since the session began" if before else none)
+    none = "no trip, failure, loss or refusal" + (" since the session began" if before else "")
+    yield ("", _grave_events(matter)) if matter else (none, [])
     if findings.faults:
-        console.print(_faults_table(findings.faults))
-    console.print()
-    figures_table(findings.model_copy(update={"trips": [], "damages": []}))
-    console.print()
-    if findings.timing:
-        table = Table("", *rows.PERCENTILES.values(), "", box=None, pad_edge=False, header_style="")
-        for row in rows.durations([findings]):
-            table.add_row(
-                row.label, *row.percentiles, sparkline(row.spread) if row.spread and console.width >= 80 else ""
-            )
-        console.print(table)
-        console.print()
-    table = labelled()
-    for label, text in _rows(findings):
-        table.add_row(label, text)
-    console.print(table)
+        yield "with faults", [_fault(fault) for fault in findings.faults]
+    yield "", _one_run(findings)
+    durations: list[Row] = []
+    for each in rows.durations([findings]):
+        percentiles = dict(zip(rows.PERCENTILES.values(), each.percentiles, strict=True))
+        durations.append({"": each.label, **percentiles, "spread": sparkline(each.spread) if each.spread else ""})
+    if durations:
+        yield "", durations
+    yield "", [{"of the log": label, "found": text} for label, text in _details(findings)]
     if findings.theorem is not None:
-        console.print()
-        for good, text in rows.theorem_sentences(findings):
-            console.print(Text(text, style="" if good is None else "green" if good else "bold red"))
+        signs = {True: "✓", False: "✗", None: ""}
+        yield "", [{"": signs[good], "theorem": text} for good, text in rows.theorem_sentences(findings)]
     others = [entry for entry in since if not grave(entry[1])]
     if before or others:
-        console.print()
-        console.print(_marks_table(before, others))
+        yield "", _other_events(before, others)
     if findings.checks:
-        console.print()
-        checks = Table(show_header=False, box=None, pad_edge=False)
-        for check in findings.checks:
-            style = "green" if check.holds else "bold red"
-            checks.add_row(f"[{style}]{'✓' if check.holds else '✗'}[/]", check.text, check.found)
-        console.print(checks)
+        checks = findings.checks
+        yield "", [{"": "✓" if each.holds else "✗", "required": each.text, "found": each.found} for each in checks]
 
 
-def comparison_tables(reports: Sequence[Report]) -> None:
-    """Print the figures of several runs and the differences between their configurations."""
-    console = Console()
-    figures = Table("", box=None)
-    differing = Table("differs in the configurations", box=None)
-    for report in reports:
-        figures.add_column(escape(report.name), justify="right")
-        differing.add_column(escape(report.name), overflow="fold")
-    figures.add_column("")
-    for row in rows.figure_rows([report.findings for report in reports]):
-        figures.add_row(row.figure.name, *(value.text for value in row.values), row.figure.unit)
-    for key, values in differences(reports):
-        differing.add_row(key, *(escape(rows.shown(value)) for value in values))
-    console.print(figures)
-    console.print()
-    console.print(differing if differing.row_count else "the configurations are the same")
-    for report in reports:
-        trips = [f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"]
-        for line in [*trips, *_some(missing(report.findings))]:
-            console.print(f"{report.name}: {line}", markup=False)
+def comparison_sheets(reports: Sequence[Report]) -> Sheets:
+    """The figures of several runs and the differences between their configurations."""
+    names = [report.name for report in reports]
+    figures: list[Row] = []
+    for figure, values, _ in rows.figure_rows([report.findings for report in reports]):
+        texts = [value.text for value in values]
+        figures.append({"": figure.name, **dict(zip(names, texts, strict=True)), " ": figure.unit})
+    yield "", figures
+    differing: list[Row] = [
+        {"": key, **dict(zip(names, map(rows.shown, values), strict=True))} for key, values in differences(reports)
+    ]
+    yield (f"{'differs in' if differing else 'no difference between'} the configurations", differing)
+    lines = [
+        f"{report.name}: {line}"
+        for report in reports
+        for line in (
+            *(f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"),
+            *_some(missing(report.findings)),
+        )
+    ]
+    if lines:
+        yield "\n".join(lines), []
 
 
-def demo_account(figures: DemoFigures) -> None:
-    """Print the faults that acted, and figures of merit."""
-    if figures.faults:
-        Console().print(_faults_table(figures.faults))
-    figures_table(figures)
-
-
-def sparkline(spread: Spread, width: int = 22) -> str:
+def sparkline(spread: Spread, width: int = 12) -> str:
     """The distribution as a row of bars: logarithm of the count over logarithm of the duration.
 
     Why logarithms: a single late tick in a million stays visible.
@@ -122,7 +114,21 @@ def sparkline(spread: Spread, width: int = 22) -> str:
     return "".join(bars).rstrip()
 
 
-def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
+def _one_run(run: Figures) -> list[Row]:
+    found = [
+        (figure, value)
+        for figure, (value,), _ in rows.figure_rows([run])
+        if figure.main or (value.number is not None and figure.key in ("duration_s", "latency_us"))
+    ]
+    unknown = any(value.why for _, value in found)
+    reasons = [{"why not": value.why or ""} if unknown else {} for _, value in found]
+    return [
+        {"figure": figure.name, "value": value.text, "unit": figure.unit} | reason
+        for (figure, value), reason in zip(found, reasons, strict=True)
+    ]
+
+
+def _details(findings: Findings) -> Iterator[tuple[str, str]]:
     for line in _some(missing(findings)):
         yield "missing", line
     if findings.gap_count:
@@ -144,6 +150,8 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
         yield "", f"… and {more} more keys; --json has them all"
+    if findings.log:
+        yield "path", findings.log
     if (part := findings.reasons.get("duration_s")) is not None:
         yield "part", part
     started = findings.started.replace("T", " ").replace("+00:00", " UTC")
@@ -160,14 +168,11 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "", f"--session N shows another of {len(its)}"
 
 
-def _faults_table(faults: Sequence[FaultInterval]) -> Table:
-    """Faults at the plant, a line each: from when to when, what it changed, and where it came from."""
-    table = labelled()
-    for i, fault in enumerate(faults):
-        until = "to the end" if fault.end_s is None else f"to {fault.end_s:.3f} s"
-        text = f"{fault.fault} from {fault.begin_s:.3f} s {until}, {fault.changed} {fault.effect} ({fault.source})"
-        table.add_row("" if i else "with faults", Text(text, style="bold red"))
-    return table
+def _fault(fault: FaultInterval) -> Row:
+    """A fault at the plant: from when to when, what it changed, and where it came from."""
+    until = "the end" if fault.end_s is None else f"{fault.end_s:.3f} s"
+    row = {"fault": fault.fault, "from": f"{fault.begin_s:.3f} s", "to": until}
+    return row | {"effect": f"{fault.changed} {fault.effect}", "source": fault.source}
 
 
 def timed(marks: Sequence[Mark]) -> list[tuple[str, Mark]]:
@@ -181,37 +186,34 @@ def timed(marks: Sequence[Mark]) -> list[tuple[str, Mark]]:
     return [(when(i, mark.time_s), mark) for i, mark in enumerate(marks)]
 
 
-def _grave_table(marks: Sequence[tuple[str, Mark]]) -> Table:
+def _event(when: str, role: str, kind: str, text: str) -> Row:
+    return {"time": when, "role": role, "event": kind, "what": text}
+
+
+def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
     """Every event that matters; of faults that differ in numbers only, the first, with count and time of the last."""
     alike: dict[tuple[str, str, str], list[tuple[str, Mark]]] = {}
     for i, (when, mark) in enumerate(marks):
         text = str(i) if mark.kind == "tripped" else re.sub(r"\d+([.,]\d+)?", "#", mark.text)
         alike.setdefault((mark.role, mark.kind, text), []).append((when, mark))
-    table = _marks()
+    found = []
     for (when, first), *more in alike.values():
         again = f" (and {len(more)} more like it, the last: {more[-1][0]})" if more else ""
-        style = "bold red" if first.kind in ("tripped", "fault") else ""
-        table.add_row(when, first.role, first.kind, Text(first.text + again), style=style)
-    return table
+        found.append(_event(when, first.role, first.kind, first.text + again))
+    return found
 
 
-def _marks_table(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, Mark]]) -> Table:
-    """Events that do not matter, after the last few from before the session; earlier ones are counted in one line."""
-    table = _marks()
+def _other_events(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, Mark]]) -> list[Row]:
+    """Events that do not matter, after the last few from before the session; earlier ones are counted in one row."""
+    found = []
     if earlier := Counter(mark.kind for _, mark in before[:-BEFORE_SHOWN]):
         counts = ", ".join(f"{n} {kind}" for kind, n in earlier.items())
-        table.add_row(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all")
-    for when, mark in [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]:
-        table.add_row(when, mark.role, mark.kind, Text(mark.text))
+        found.append(_event(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all"))
+    shown = [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]
+    found += [_event(when, mark.role, mark.kind, mark.text) for when, mark in shown]
     if (more := len(marks) - MARKS_SHOWN) > 0:
-        table.add_row("", "", "", f"… and {more} more such events; --json has them all")
-    return table
-
-
-def _marks() -> Table:
-    times, texts = Column(justify="right", no_wrap=True), Column(overflow="fold")
-    roles, kinds = Column(no_wrap=True), Column(no_wrap=True)
-    return Table(times, roles, kinds, texts, show_header=False, box=None, pad_edge=False)
+        found.append(_event("", "", "", f"… and {more} more such events; --json has them all"))
+    return found
 
 
 def _some(lines: Sequence[str], shown: int = DAMAGES_SHOWN) -> list[str]:
@@ -219,18 +221,22 @@ def _some(lines: Sequence[str], shown: int = DAMAGES_SHOWN) -> list[str]:
     return [*lines[:shown], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
-def replay_table(replay: Replay) -> None:
-    """Print the result of a replay."""
-    console = Console()
-    table = Table("session", "from tick", "ticks", "differ", "rms", "largest", "u_total", box=None)
-    for session in replay.sessions:
-        first_tick = "–" if session.first_tick is None else str(session.first_tick)
-        rms = "–" if session.rms_v is None else f"{session.rms_v:.3f} V"
-        largest = "–" if session.max_v is None else f"{session.max_v:.2f} V"
-        efforts = f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s"
-        counts = str(session.ticks), str(session.differ)
-        table.add_row(f"{session.vehicle}/{session.session}", first_tick, *counts, rms, largest, efforts)
-    console.print(table)
+def replay_sheets(replay: Replay) -> Sheets:
+    """A row for each session, where each end first differs, and the verdict on each end."""
+    sessions: list[Row] = [
+        {
+            "session": f"{one.vehicle}/{one.session}",
+            "from tick": "–" if one.first_tick is None else str(one.first_tick),
+            "ticks": str(one.ticks),
+            "differ": str(one.differ),
+            "rms V": "–" if one.rms_v is None else f"{one.rms_v:.3f}",
+            "largest V": "–" if one.max_v is None else f"{one.max_v:.2f}",
+            "u_total V²·s": f"{one.u_total_logged:.1f} → {one.u_total_computed:.1f}",
+        }
+        for one in replay.sessions
+    ]
+    if sessions:
+        yield "", sessions
     lines = [
         f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): {first.logged} logged, "
         f"{first.computed} computed"
@@ -247,8 +253,7 @@ def replay_table(replay: Replay) -> None:
     lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
-    for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+    yield "\n".join(lines), []
 
 
 def _replayed(replay: Replay, name: End) -> str:
