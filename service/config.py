@@ -22,13 +22,12 @@ from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
-from aeroloop.service.config_sources import merge, sources, tree_of
+from aeroloop.service.config_sources import VehicleAddress, merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import LawSection, own_settings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
-from aeroloop.service.vehicle_address import VehicleAddress
 
 
 class PointsFile(BaseModel, extra="forbid"):

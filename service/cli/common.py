@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
+    from aeroloop.service.config_sources import VehicleAddress
     from aeroloop.service.terminal.show import Sheets
-    from aeroloop.service.vehicle_address import VehicleAddress
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -37,18 +37,13 @@ state = {"debug": False}
 logged_as: list[str] = []
 """The role of a daemon that logs JSON, so that its last error is a line of JSON, too; empty in other commands."""
 
-Config = Annotated[
-    Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.", show_default=False)
-]
+Config = Annotated[Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.")]
 Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.")
 ]
 Duration = Annotated[float, typer.Option("--duration", metavar="S", min=0.01, help="Length of the experiment, in s.")]
-BitsOut = Annotated[
-    str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
-]
-BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
+BitsOut = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.")]
+BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.")]
 EngineOption = Annotated[
     str,
     typer.Option(
@@ -60,7 +55,7 @@ EngineOption = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
 Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown.")]
-NewLog = Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)]
+NewLog = Annotated[Path | None, typer.Option("--log", help="New log, or its folder.")]
 Require = Annotated[
     list[str] | None,
     typer.Option(
@@ -68,7 +63,6 @@ Require = Annotated[
         metavar="FIGURE=LIMIT",
         help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped=0 or "
         "latency.p99=2000; theorem=1: unless the run kept to all that is proven.",
-        show_default=False,
     ),
 ]
 LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
@@ -106,7 +100,7 @@ def loop_of(config: Path | None, overrides: Sequence[str] | None, *more: str) ->
 
 def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleAddress:
     """Vehicle and network of the effective configuration; a configuration error ends the command."""
-    from aeroloop.service.vehicle_address import load_vehicle_address
+    from aeroloop.service.config_sources import load_vehicle_address
 
     with checked():
         return load_vehicle_address(config, overrides or ())

@@ -26,7 +26,6 @@ Directory = Annotated[
     Path | None,
     typer.Option(
         "--directory", help="Folder; network.security.directory if configured, else ~/.config/aeroloop/keys.",
-        show_default=False,
     ),
 ]  # fmt: skip
 
@@ -61,9 +60,7 @@ def doctor(
 
 @group.command()
 def units(
-    install: Annotated[
-        Path | None, typer.Option("--install", help="Write the units into this folder instead.", show_default=False)
-    ] = None,
+    install: Annotated[Path | None, typer.Option("--install", help="Write the units into this folder instead.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace units that exist.")] = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -113,8 +110,7 @@ def issue(
     role: Annotated[str, typer.Argument(help="plant, controller, operator, observer, recorder, router.")],
     name: Annotated[str, typer.Argument(help="Host or person that gets it.")],
     vehicle: Annotated[
-        str | None,
-        typer.Option(help="Its vehicle, which plant and controller need; every vehicle if none.", show_default=False),
+        str | None, typer.Option(help="Its vehicle, which plant and controller need; every vehicle if none.")
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificate is valid, in days.")] = 90,
     directory: Directory = None,

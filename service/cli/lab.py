@@ -40,7 +40,6 @@ _Bits = Annotated[
         metavar="OUT/IN",
         help="Bits of ε and ω, and of u, such as 8/6 or cont/cont; may be repeated; six pairs if left out, for laws "
         "8/6 and cont/cont.",
-        show_default=False,
     ),
 ]
 _Sensors = Annotated[
@@ -50,16 +49,12 @@ _Sensors = Annotated[
         metavar="NAME",
         help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; all four if "
         "left out, for laws encoders. A free body has no encoders: perfect.",
-        show_default=False,
     ),
 ]
 _Seeds = Annotated[
     int, typer.Option("--seeds", min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
 ]
-_Figure = Annotated[
-    Path | None,
-    typer.Option("--figure", help="Draw the result: a .png, .svg or .pdf file.", show_default=False),
-]
+_Figure = Annotated[Path | None, typer.Option("--figure", help="Draw the result: a .png, .svg or .pdf file.")]
 _ROWS = "Table of all experiments. Rows are kept in FILE.jsonl as they come: the same command goes on there."
 _TABLE = "FILE.parquet|FILE.csv"
 
@@ -72,7 +67,7 @@ def experiment(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run the closed loop in this process, in lockstep, without a network."""
+    """Run the closed loop in this process, without a network."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.log_sheets import figure_sheets
@@ -90,7 +85,7 @@ def tables(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
+    """Predict the paper's Tables C.2 to C.4. Beside the published values."""
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.tables import predict, sheets
@@ -101,7 +96,7 @@ def tables(
 
 
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
+    """Fit the plant to two of the paper's cells, calm and windy."""
     settings = loop_of(config, overrides)
     from aeroloop.service.lab.tables import calibrate, calibration_sheets
 
@@ -113,11 +108,7 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
 def certify(
     disturbance: Annotated[
         float | None,
-        typer.Option(
-            min=0,
-            help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it.",
-            show_default=False,
-        ),
+        typer.Option(min=0, help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it."),
     ] = None,
     late: Annotated[float, typer.Option(min=0, help="Further delay of commands, in s.")] = 0.0,
     attitude_error: Annotated[
@@ -128,7 +119,6 @@ def certify(
             max=180,
             help="Assumed bound of the attitude error, in degrees; controller.start_within_deg if left out; 180 "
             "assumes nothing.",
-            show_default=False,
         ),
     ] = None,
     bits_out: BitsOut = None,
@@ -138,7 +128,7 @@ def certify(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
+    """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.theorem.any_law import certify_any
@@ -157,7 +147,6 @@ def burden(
             metavar="KIND",
             help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
             "the rest); may be repeated; all four if left out.",
-            show_default=False,
         ),
     ] = None,
     sensors: _Sensors = None,
@@ -170,7 +159,7 @@ def burden(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
+    """Measure error against bits, for every quantizer and sensor. Beside each transmit policy and float64."""
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
@@ -192,14 +181,12 @@ def laws(
         typer.Option(
             metavar="KIND",
             help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out.",
-            show_default=False,
         ),
     ] = None,
     bits: _Bits = None,
     sensors: _Sensors = None,
     wind: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="calm or wind; may be repeated; both if left out.", show_default=False),
+        list[str] | None, typer.Option(metavar="NAME", help="calm or wind; may be repeated; both if left out.")
     ] = None,
     plant: Annotated[
         list[str] | None,
@@ -207,7 +194,6 @@ def laws(
             metavar="KIND",
             help="aero, rigid_body (a free body like it, with three motors), or a plant of your own, as plant.kind "
             "takes it; may be repeated; the first two if left out.",
-            show_default=False,
         ),
     ] = None,
     within: Annotated[
@@ -219,7 +205,7 @@ def laws(
     seeds: _Seeds = 1,
     duration: Duration = PAPER_DURATION_S,
     engine: EngineOption = "processes",
-    out: Annotated[Path | None, typer.Option(metavar=_TABLE, help=_ROWS, show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(metavar=_TABLE, help=_ROWS)] = None,
     figure: _Figure = None,
     force: Force = False,
     markdown: Markdown = False,
@@ -227,7 +213,7 @@ def laws(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
+    """Compare control laws, tuned alike. Error, effort, chatter, bits, and the delay and loss that each survives."""
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.laws import compare, draw_laws, run_comparison, sheets
@@ -249,14 +235,13 @@ def laws(
 
 
 def sweep(
-    out: Annotated[Path, typer.Option(metavar=_TABLE, help=_ROWS, show_default=False)],
+    out: Annotated[Path, typer.Option(metavar=_TABLE, help=_ROWS)],
     vary: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
             help="section.key=a,b,c or section.key=a..b*n, n values evenly from a to b; may be repeated, for every "
             "combination.",
-            show_default=False,
         ),
     ] = None,
     seeds: _Seeds = 1,
@@ -267,7 +252,7 @@ def sweep(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run an experiment for every combination of values and seeds, and write a table of their figures."""
+    """Run an experiment for every combination of values and seeds. Writes a table of their figures."""
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.axes import configurations, parse_axes
@@ -288,7 +273,6 @@ def tune(
         typer.Option(
             metavar="NAME",
             help="Gain, or other number of the law's settings; may be repeated; all of the law's gains if left out.",
-            show_default=False,
         ),
     ] = None,
     scale: Annotated[
@@ -301,16 +285,11 @@ def tune(
             min=0,
             max=1,
             help="Largest part of the ticks with a voltage at its limit; 1.25 × the configured gains' if left out.",
-            show_default=False,
         ),
     ] = None,
     max_chatter: Annotated[
         float | None,
-        typer.Option(
-            min=0,
-            help="Most changes of a voltage a second; 1.25 × the configured gains' if left out.",
-            show_default=False,
-        ),
+        typer.Option(min=0, help="Most changes of a voltage a second; 1.25 × the configured gains' if left out."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds of wind and sensors.")] = 2,
     winds: Annotated[
@@ -326,16 +305,14 @@ def tune(
         float, typer.Option(metavar="DEG", min=0, help="Bound of the attitude error with delay or lost frames.")
     ] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed finds the same.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.")] = None,
     engine: EngineOption = "processes",
     force: Force = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
+    """Search a law's gains for the least error and effort. Exits with 1 if they are worse in runs not searched."""
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.sweep import open_workers

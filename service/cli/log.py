@@ -32,13 +32,10 @@ if TYPE_CHECKING:
     from aeroloop.service.review.report import Report
     from aeroloop.service.terminal.show import Sheets
 
-Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
-Html = Annotated[
-    Path | None, typer.Option("--html", help="Write an interactive page that needs no network.", show_default=False)
-]
+Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.")]
+Html = Annotated[Path | None, typer.Option("--html", help="Write an interactive page that needs no network.")]
 Vehicle = Annotated[
-    str | None,
-    typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.", show_default=False),
+    str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.")
 ]
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
 Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
@@ -50,15 +47,13 @@ group = typer.Typer()
 def review(
     logs: Logs,
     figures: Annotated[
-        Path | None,
-        typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
+        Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.")
     ] = None,
     since_s: Since = -inf,
     until_s: Until = inf,
     require: Require = None,
     session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.", show_default=False),
+        str | None, typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.")
     ] = None,
     vehicle: Vehicle = None,
     html: Html = None,
@@ -98,7 +93,7 @@ def review(
 
 @group.command()
 def compare(
-    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.", show_default=False)],
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.")],
     html: Html = None,
     require: Require = None,
     force: Force = False,
@@ -158,8 +153,7 @@ def replay(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override the logged configuration.")
     ] = None,
     end: Annotated[
-        Literal["controller", "plant"] | None,
-        typer.Option("--end", help="Only this end; both if left out.", show_default=False),
+        Literal["controller", "plant"] | None, typer.Option("--end", help="Only this end; both if left out.")
     ] = None,
     since_s: Since = -inf,
     until_s: Until = inf,
@@ -205,7 +199,7 @@ def live(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Serve a running loop to Foxglove or Lichtblick over a WebSocket until ^C."""
+    """Serve a running loop to Foxglove or Lichtblick until ^C. It is a WebSocket."""
     settings = settings_of(config, overrides)
     vehicle = settings.vehicle
 
@@ -226,12 +220,10 @@ def export(
     logs: Logs,
     to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="Format of the new file.")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="The new file; the log's name with another suffix if left out.", show_default=False),
+        Path | None, typer.Option("--out", help="The new file; the log's name with another suffix if left out.")
     ] = None,
     session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.", show_default=False),
+        str | None, typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.")
     ] = None,
     vehicle: Vehicle = None,
     since_s: Since = -inf,

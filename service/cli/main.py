@@ -18,11 +18,11 @@ from aeroloop.service.cli.common import logged_as, report, state
 from aeroloop.service.cli.entry import INTERRUPTED
 
 _GROUPS: Final = {
-    "lab": (lab.group, "Experiments, tables, calibration and certificates, in lockstep."),
-    "log": (log.group, "Review, compare, replay, recover and export logs; view a live loop."),
+    "lab": (lab.group, "Experiments, sweeps, tuning and certificates, in lockstep."),
+    "log": (log.group, "Review, compare, replay, recover and export logs."),
     "op": (op.group, "Operate running roles over the network."),
     "host": (host.group, "Check this machine, install its daemons, make its keys."),
-    "show": (show.group, "Print the configuration, the wire, a DBC file, a layout, examples."),
+    "show": (show.group, "Print the configuration, the wire, a layout, examples."),
 }
 
 _EXTRAS: Final = {

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.messages.models import SessionRecord
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
-    from aeroloop.service.vehicle_address import VehicleAddress
+    from aeroloop.service.config_sources import VehicleAddress
 
 Three = tuple[float, float, float]
 Within = Annotated[
@@ -177,7 +177,6 @@ def inject(
         typer.Argument(
             metavar="FAULT",
             help="As rate:off, rate:off@1..2 (in s from now) or command:drop=0.1; plant_emulator/faults has all.",
-            show_default=False,
         ),
     ] = None,
     clear: Annotated[bool, typer.Option("--clear", help="First remove all faults, configured ones too.")] = False,
@@ -254,12 +253,10 @@ def track(
     ],
     within_s: Within = WITHIN_S,
     amplitude: Annotated[
-        Three | None,
-        typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.", show_default=False),
+        Three | None, typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.")
     ] = None,
     frequency: Annotated[
-        Three | None,
-        typer.Option(help="sinusoid: of roll, pitch, yaw (rad/s); the paper's if left out.", show_default=False),
+        Three | None, typer.Option(help="sinusoid: of roll, pitch, yaw (rad/s); the paper's if left out.")
     ] = None,
     timeout_s: Annotated[
         float | None, typer.Option("--timeout", help="stream: hold after this long without a set-point, in s.")

@@ -44,7 +44,6 @@ Faults = Annotated[
         "--fault",
         metavar="SIGNAL:KIND@T",
         help="Fault to inject, such as rate:off@5 or command:drop=0.05; may be repeated.",
-        show_default=False,
     ),
 ]
 
@@ -55,10 +54,7 @@ group = typer.Typer()
 def demo(
     duration: Duration = PAPER_DURATION_S,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
-    via: Annotated[
-        str | None,
-        typer.Option("--via", metavar="emulator|can", help="Plant end to run.", show_default=False),
-    ] = None,
+    via: Annotated[str | None, typer.Option("--via", metavar="emulator|can", help="Plant end to run.")] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     log: NewLog = None,
@@ -89,9 +85,7 @@ def demo(
 
 @group.command()
 def controller(
-    duration: Annotated[
-        float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.", show_default=False)
-    ] = None,
+    duration: Annotated[float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.")] = None,
     auto_arm: Annotated[
         bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
     ] = False,
@@ -174,7 +168,7 @@ def router(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run a router for clients until SIGTERM, which have network.mode = "client"."""
+    """Run a router for clients until SIGTERM. They have network.mode = "client"."""
     log_as("router", log_format)
     settings = settings_of(config, overrides)
     if print_config:

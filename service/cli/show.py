@@ -63,11 +63,9 @@ def layout(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def examples(
-    name: Annotated[
-        str | None, typer.Argument(help="Example to print; all are listed if left out.", show_default=False)
-    ] = None,
+    name: Annotated[str | None, typer.Argument(help="Example to print; all are listed if left out.")] = None,
 ) -> None:
-    """List the example configurations and programs, or print one of them."""
+    """List the example configurations and programs, or print one."""
     files = sorted(file for end in ("*.toml", "*.py") for file in EXAMPLES.glob(end) if file.name != "__init__.py")
     texts = {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in files}
     if name is None:

@@ -10,6 +10,7 @@ import os
 import resource
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -30,13 +31,14 @@ SHARE_OF_PERIOD: Final = 0.25
 """Latest wake-up, as a share of the period; after it too little time is left for two crossings of the network."""
 
 
-class Finding(BaseModel, frozen=True):
-    """One thing that was checked."""
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was checked, and what to change where it is not good."""
 
     what: str
     good: bool
     found: str
-    advice: str = Field(default="", description="what to change, where it is not good")
+    advice: str = ""
 
 
 class Diagnosis(BaseModel, frozen=True):
@@ -70,8 +72,7 @@ def diagnose(
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     awake = "let the user write to it, or use tuned's profile latency-performance"
     findings += [
-        Finding(what="set-up", good=False, found=line, advice=awake if "CPUs sleep" in line else "run it as a service")
-        for line in refusals
+        Finding("set-up", False, line, awake if "CPUs sleep" in line else "run it as a service") for line in refusals
     ]
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
     ticks, report_every = loop.ticks(CHECK_S), max(1, loop.ticks(0.2))
@@ -85,10 +86,10 @@ def diagnose(
     limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
     late = wake is None or wake.p999 > limit_us
     trial = Finding(
-        what=f"{CHECK_S:g} s at {loop.rate_hz:g} Hz",
-        good=not late and grid.skipped == 0,
-        found=f"{grid.skipped} ticks skipped, 99.9 % of wake-ups within {wake.p999 if wake else float('nan'):.0f} µs",
-        advice=f"want none skipped and {limit_us:.0f} µs: lower loop.rate_hz, free or isolate a CPU (loop.cpus), or "
+        f"{CHECK_S:g} s at {loop.rate_hz:g} Hz",
+        not late and grid.skipped == 0,
+        f"{grid.skipped} ticks skipped, 99.9 % of wake-ups within {wake.p999 if wake else float('nan'):.0f} µs",
+        f"want none skipped and {limit_us:.0f} µs: lower loop.rate_hz, free or isolate a CPU (loop.cpus), or "
         "use a kernel with PREEMPT_RT",
     )
     return Diagnosis(
@@ -103,15 +104,15 @@ def _certificates(directory: Path) -> Iterator[Finding]:
     try:
         rows = show(directory)
     except CertificateError as error:
-        yield Finding(what="certificates", good=False, found="no authority", advice=str(error))
+        yield Finding("certificates", False, "no authority", str(error))
         return
     for row in rows:
         days = row.days_left
         yield Finding(
-            what=row.file,
-            good=row.problem is None and days is not None and days >= SOON_DAYS,
-            found="no certificate of a role" if days is None else f"{days:.0f} days left",
-            advice=row.problem or "move it and its key away, `aeroloop host keys issue` it anew, and restart",
+            row.file,
+            row.problem is None and days is not None and days >= SOON_DAYS,
+            "no certificate of a role" if days is None else f"{days:.0f} days left",
+            row.problem or "move it and its key away, `aeroloop host keys issue` it anew, and restart",
         )
 
 
@@ -125,7 +126,7 @@ def refused(network: NetworkSettings) -> list[Finding]:
 
     directory = network.security.folder
     if directory is None:
-        return [Finding(what="network", good=True, found="no certificates, so none is refused")]
+        return [Finding("network", True, "no certificates, so none is refused")]
     found = [read_certificate(directory / row.file) for row in show(directory)[1:] if row.problem is None]
     tries = [
         (place, certificate)
@@ -136,10 +137,10 @@ def refused(network: NetworkSettings) -> list[Finding]:
     with ThreadPoolExecutor(max(1, len(tries))) as pool:
         lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))
     return [
-        Finding(what=each.file.name, good=False, found=f"refused at {place}", advice=line)
+        Finding(each.file.name, False, f"refused at {place}", line)
         for (place, each), line in zip(tries, lines, strict=True)
         if line
-    ] or [Finding(what="network", good=True, found=f"none of {len(found)} certificates is refused")]
+    ] or [Finding("network", True, f"none of {len(found)} certificates is refused")]
 
 
 def _settings() -> Iterator[Finding]:
@@ -147,40 +148,27 @@ def _settings() -> Iterator[Finding]:
     root = os.geteuid() == 0
     priority, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     memory, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    unlimited = memory == resource.RLIM_INFINITY
     clock, runtime, governor = map(host_facts().get, ("clock", "realtime_throttling_us", "governor"))
+    yield Finding(
+        "clock source",
+        clock in GOOD_CLOCKS,
+        clock or "not reported by this kernel",
+        "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
+    )
+    rights = "give the user {0} (systemd), or '{1}' in /etc/security/limits.d"
+    allowed = "root may" if root else f"limit {priority}"
+    yield Finding("real-time priority", root or priority != 0, allowed, rights.format("LimitRTPRIO=10", "rtprio 10"))
+    unlimited = memory == resource.RLIM_INFINITY
+    allowed = "root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB"
+    yield Finding(
+        "locked memory", root or unlimited, allowed, rights.format("LimitMEMLOCK=infinity", "memlock unlimited")
+    )
     throttled = "off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported"
-    memory_found = "root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB"
-    for what, good, found, advice in (
-        (
-            "clock source",
-            clock in GOOD_CLOCKS,
-            clock or "not reported by this kernel",
-            "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
-        ),
-        (
-            "real-time priority",
-            root or priority != 0,
-            "root may" if root else f"limit {priority}",
-            "give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
-        ),
-        (
-            "locked memory",
-            root or unlimited,
-            memory_found,
-            "give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
-        ),
-        (
-            "real-time throttling",
-            runtime is not None,
-            throttled,
-            "the kernel does not report how much time real-time tasks may take",
-        ),
-        (
-            "CPU frequency",
-            governor in (None, "performance"),
-            governor or "not scaled by this kernel",
-            "set the governor to performance: cpupower frequency-set -g performance",
-        ),
-    ):
-        yield Finding(what=what, good=good, found=found, advice=advice)
+    unknown = "the kernel does not report how much time real-time tasks may take"
+    yield Finding("real-time throttling", runtime is not None, throttled, unknown)
+    yield Finding(
+        "CPU frequency",
+        governor in (None, "performance"),
+        governor or "not scaled by this kernel",
+        "set the governor to performance: cpupower frequency-set -g performance",
+    )

@@ -3,59 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Percentiles
+from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
-from aeroloop.service.figures import Figures, StreamFigures
+from aeroloop.service.figures import Figures
 from aeroloop.service.review.review import report, review
 from aeroloop.service.testing.process_group import HilError
 
 
-class _Present:
-    """A model each of whose values is read as present: one that the log lacks raises HilError with the reason."""
-
-    if not TYPE_CHECKING:  # declared attributes keep their types, and others are still errors
-
-        def __getattribute__(self, name: str) -> Any:
-            value = super().__getattribute__(name)
-            if value is None and name in type(self).model_fields:
-                why = getattr(self, "reasons", {}).get(name, "no tick was recorded")
-                raise HilError(f"the log gives no {name}: {why}")
-            return value
-
-
-class RunStream(_Present, StreamFigures):
-    """Traffic in one direction of a run that has ended."""
-
-    frames_per_s: float
-    bits_per_s: float
-
-
-class RunFigures(_Present, Figures):
+@dataclass(frozen=True)
+class RunFigures:
     """Figures of merit of a run that has ended; reading one that its log lacks raises HilError."""
 
-    z_track: float
-    u_total: float
-    max_error_deg: float
-    final_error_deg: float
-    measurement: RunStream
-    command: RunStream
-    skipped_ticks: int
-    latency_us: Percentiles
-    log: str
+    found: Figures
 
-    @classmethod
-    def of(cls, figures: Figures) -> RunFigures:
-        """The same figures."""
-        found = dict(figures)
-        streams = {name: RunStream.model_construct(**dict(found[name])) for name in ("measurement", "command")}
-        return cls.model_construct(**{**found, **streams})
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.found, name)
+        if value is None:
+            raise HilError(f"the log gives no {name}: {self.found.reasons.get(name, 'no tick was recorded')}")
+        return value
 
 
 class HilLog:
@@ -67,7 +40,7 @@ class HilLog:
     @property
     def figures(self) -> RunFigures:
         """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
-        return RunFigures.of(review(self._existing()))
+        return RunFigures(review(self._existing()))
 
     @property
     def events(self) -> list[Event]:

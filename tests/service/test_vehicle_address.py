@@ -8,9 +8,8 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings
-from aeroloop.service.config_sources import ConfigError
+from aeroloop.service.config_sources import UNREAD, ConfigError, VehicleAddress, load_vehicle_address
 from aeroloop.service.host import operator
-from aeroloop.service.vehicle_address import UNREAD, VehicleAddress, load_vehicle_address
 
 
 def test_every_other_section_is_left_unread() -> None:

@@ -19,7 +19,7 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.vehicle_address import load_vehicle_address
+from aeroloop.service.config_sources import load_vehicle_address
 
 STOP_WAIT_S: Final = 10.0
 RECOVERY_S: Final = 10.0

@@ -29,8 +29,8 @@ from aeroloop.protocol.transport.network_settings import (
 )
 from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.transport.zenoh_config import tls_config
+from aeroloop.service.config_sources import load_vehicle_address
 from aeroloop.service.testing.process_group import free_rendezvous
-from aeroloop.service.vehicle_address import load_vehicle_address
 from tests.support.certificates import DAY, Authority
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 

@@ -253,7 +253,9 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
     assert "latency 300 µs 300 µs 300 µs 300 µs 300 µs" in out
-    assert out.startswith("time role event what 0.410 s plant tripped the [red] limit 0 0.420 s plant tripped the [red] limit 1 0.500 s")
+    assert out.startswith(
+        "time role event what 0.410 s plant tripped the [red] limit 0 0.420 s plant tripped the [red] limit 1 0.500 s"
+    )
     assert out.index("no 0 refused") < out.index(" z_track ") < out.index("no 0 armed")
     assert "plant refused no 0 refused (and 14 more like it, the last: 0.500 s)" in out
     assert "… and 4 more such events" in out  # beside what the session began with

@@ -59,11 +59,11 @@ def test_settings_may_be_nested_or_dotted_or_both() -> None:
 def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 20)
     judged = review(tmp_path / "a.mcap")
-    figures = RunFigures.of(judged)
+    figures = RunFigures(judged)
     assert figures.z_track == judged.z_track
     assert figures.command.frames_per_s == judged.command.frames_per_s
     assert figures.model_dump() == judged.model_dump()
-    lacking = RunFigures.of(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
+    lacking = RunFigures(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
     with pytest.raises(HilError, match="the log gives no z_track: nothing answered"):
         _ = lacking.z_track
 
