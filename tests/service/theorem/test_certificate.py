@@ -257,7 +257,7 @@ def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     """The correction of (C.66), against random errors: z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃ ≥ c₀ ‖z₁‖², and c₀ is all but attained."""
     law = AdaptiveSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
     most = radians(100)
-    settings = Settings(wire=PAPER.wire.with_bits(None, None), law=law, reference=STILL)
+    settings = Settings(wire=PAPER.wire.with_bits("cont"), law=law, reference=STILL)
     c0 = theorem_of(evaluate(settings, attitude_error_deg=degrees(most))).c0
     rng = np.random.default_rng(0)
     half, axis = most / 2 * rng.random(20_000), rng.standard_normal((20_000, 3)) * [0.1, 1, 0.1]
