@@ -266,6 +266,7 @@ def sweep(
     ] = None,
     seeds: _Seeds = 1,
     duration: Duration = PAPER_DURATION_S,
+    bits: BitsOption = None,
     engine: EngineOption = "processes",
     force: Force = False,
     json: Json = False,
@@ -273,7 +274,7 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds, and write a table of their figures."""
-    settings = loop_of(config, overrides)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     check_engine(engine)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets

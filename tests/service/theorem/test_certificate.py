@@ -194,6 +194,24 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
     assert found.plant_radius is None
 
 
+def test_an_integral_is_disturbed_only_by_what_changes() -> None:
+    """2 mN·m of wind that stays, on a free body that hardly turns."""
+    slow = ["plant.ideal=false", "plant.rotor.lag_up_s=0", "plant.rotor.lag_down_s=0", "plant.friction.viscous=[]",
+            "plant.friction.coulomb=[]", "plant.sensors.attitude=perfect", "plant.sensors.rate=perfect",
+            "plant.wind.torque=[0, 0.002, 0]", "plant.wind.gust=0", "reference.frequency=[0, 0.01, 0.005]"]  # fmt: skip
+    grown = {}
+    for kind in ("pd", "pid"):
+        calm, windy = (
+            certify(certified_settings(14, 14, f"law.kind={kind}", *slow, f"plant.wind.blowing={blows}"), margins=False)
+            for blows in ("false", "true")
+        )
+        assert calm.plant_radius is not None
+        assert windy.plant_radius is not None
+        grown[kind] = windy.plant_radius / calm.plant_radius
+    assert grown["pid"] < 1.1  # what turns
+    assert grown["pd"] > 1.5
+
+
 def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
     for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), certified_settings(3, 3)):
         found = certify(settings)
