@@ -371,7 +371,8 @@ def tune(
 def design(
     error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
     kbit: Annotated[
-        float | None, typer.Option(min=0, help="Largest payload of both frames, in kbit/s.", show_default=False)
+        float | None,
+        typer.Option(min=0, metavar="KBIT", help="Largest payload of both frames, in kbit/s.", show_default=False),
     ] = None,
     rates: Annotated[
         list[float] | None,

@@ -401,9 +401,9 @@ _REACH: Final = {
     "omega_e": ("max ‖ω_e‖", "rad/s", "rate error within it"),
     "axis_rate": ("max |ω_k| reached", "rad/s", "rate about an axis within it"),
     "slow": ("‖w_s‖", "N·m", "slow torque: θ̃ along the reference, steady wind"),
-    "fast": ("‖w_f‖", "N·m", "fast torque: age, friction, wind, θ̃ on the error's rate"),
-    "noise": ("‖w_q‖", "N·m", "error of the command by quantization and sensors"),
-    "hold": ("τ_h of the plant", "N·m", "the part of ‖w_f‖ by which commands are out of date"),
+    "fast": ("‖w_f‖", "N·m", "fast torque: friction and gusts; θ̃ on the error's rate"),
+    "noise": ("‖w_q‖", "N·m", "error of the command by quantizers and sensors"),
+    "hold": ("τ_h of the plant", "N·m", "torque by which commands are out of date"),
     "deviation": ("max ‖B u − B u_d‖", "N·m", "command beyond that of the reference"),
 }
 
