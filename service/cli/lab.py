@@ -10,8 +10,7 @@ import typer
 
 from aeroloop.service.cli.common import (
     PAPER_DURATION_S,
-    BitsIn,
-    BitsOut,
+    BitsOption,
     Config,
     Duration,
     EngineOption,
@@ -61,14 +60,13 @@ _TABLE = "FILE.parquet|FILE.csv"
 
 def experiment(
     duration: Duration = PAPER_DURATION_S,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, without a network."""
-    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.log_sheets import figure_sheets
 
@@ -121,15 +119,14 @@ def certify(
             "assumes nothing.",
         ),
     ] = None,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
-    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.theorem.any_law import certify_any
 
@@ -246,6 +243,7 @@ def sweep(
     ] = None,
     seeds: _Seeds = 1,
     duration: Duration = PAPER_DURATION_S,
+    bits: BitsOption = None,
     engine: EngineOption = "processes",
     force: Force = False,
     json: Json = False,
@@ -253,7 +251,7 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds. Writes a table of their figures."""
-    settings = loop_of(config, overrides)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     check_engine(engine)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets
@@ -335,6 +333,40 @@ def tune(
     raise typer.Exit(INTERRUPTED if found.interrupted else 1 if found.worse else 0)
 
 
+def design(
+    error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
+    kbit: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="KBIT", help="Largest payload of both frames, in kbit/s."),
+    ] = None,
+    rates: Annotated[
+        list[float] | None,
+        typer.Option("--rate", metavar="HZ", help="Rate; may be repeated; as configured if left out."),
+    ] = None,
+    gains: Annotated[bool, typer.Option("--gains", help="Search the law's gains, too.")] = False,
+    plant: Annotated[bool, typer.Option("--plant", help="Of the configured plant, not of the paper's body.")] = False,
+    delay: Annotated[float, typer.Option(min=0, metavar="S", help="Further delay of every command, in s.")] = 0.0,
+    loss: Annotated[int, typer.Option(min=0, metavar="N", help="Most frames lost in a row.")] = 0,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Search bits, rate and gains for the least payload. Its attitude error is proven."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab import design as lab
+
+    with working("designs", json) as update:
+        found = lab.design(
+            settings, error_deg=error, kbit=kbit, rates=rates or (), gains=gains, plant=plant, delay_s=delay, lost=loss,
+            duration_s=duration, progress=update, engine=engine,
+        )  # fmt: skip
+    show(found, json, lab.sheets, markdown)
+
+
 group = typer.Typer()
-for verb in (experiment, tables, calibrate, certify, burden, laws, sweep, tune):
+for verb in (experiment, tables, calibrate, certify, burden, laws, sweep, tune, design):
     group.command()(verb)

@@ -12,8 +12,7 @@ import typer
 
 from aeroloop.service.cli.common import (
     PAPER_DURATION_S,
-    BitsIn,
-    BitsOut,
+    BitsOption,
     Config,
     Duration,
     Json,
@@ -55,8 +54,7 @@ def demo(
     duration: Duration = PAPER_DURATION_S,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
     via: Annotated[str | None, typer.Option("--via", metavar="emulator|can", help="Plant end to run.")] = None,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     log: NewLog = None,
     json: Json = False,
     config: Config = None,
@@ -64,7 +62,7 @@ def demo(
 ) -> None:
     """Run the paper's experiment in three processes over Zenoh. Then review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
-    settings = with_bits_of(loop_of(config, overrides, *options), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides, *options), bits)
     from aeroloop.service.lab.demo import run_demo
     from aeroloop.service.terminal.display import demo_progress
     from aeroloop.service.terminal.log_sheets import demo_sheets

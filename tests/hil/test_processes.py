@@ -84,7 +84,7 @@ def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_re
 
 
 def test_a_demo_in_lockstep_without_quantization_gives_the_experiments_figures_to_the_last_bit(tmp_path: Path) -> None:
-    cell = ("--duration", "1", "--bits-out", "cont", "--bits-in", "cont")
+    cell = ("--duration", "1", "--bits", "cont")
     demo = aeroloop("demo", "--lockstep", "--log", str(tmp_path / "a.mcap"), *cell)
     experiment = aeroloop("lab", "experiment", *cell)
     assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}

@@ -79,7 +79,7 @@ def test_our_aero_as_an_fmu_moves_as_our_emulated_one_along_the_papers_experimen
 
     1e-12 leaves room for another compiler's library of sines; without closed loop, nothing grows faster than the time.
     """
-    course = experiment(with_bits(load(overrides=["plant.ideal=true"]), "8", "6"), 50.0).course
+    course = experiment(with_bits(load(overrides=["plant.ideal=true"]), "8/6"), 50.0).course
     voltages = [(float(u2), float(u3)) for u2, u3 in course.voltages]
     ours = flat(driven(IDEAL.build(PERIOD), voltages))
     assert np.ptp(ours[:, 3]) > 0.1  # it does move: this is sin(ψ/2) cos(θ/2)
@@ -309,7 +309,7 @@ FIGURES = ("z_track", "u_total", "max_error_deg", "measurement", "command")
 def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
     configuration: Callable[[str], Path], mapping: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cell = ["lab", "experiment", "--json", "--duration", "4", "--bits-out", "cont", "--bits-in", "cont"]
+    cell = ["lab", "experiment", "--json", "--duration", "4", "--bits", "cont"]
     assert execute([*cell, "--config", str(configuration(mapping))]) == 0
     theirs = json.loads(capsys.readouterr().out)
     assert execute([*cell, "--set", "plant.ideal=true"]) == 0
