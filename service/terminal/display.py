@@ -29,13 +29,13 @@ class _Done(ProgressColumn):
 
 @contextmanager
 def progress_bar(title: str, total: float | None = None, *, hidden: bool = False) -> Iterator[Callable[..., None]]:
-    """A bar, updated by the yielded `update(done, total, title)`; total and title only where they change."""
+    """A bar, updated by the yielded `update(done, total, title)`; what is None stays."""
     console = Console(stderr=True)
     columns = TextColumn("{task.description}", markup=False), BarColumn(20), _Done(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as progress:
         task = progress.add_task(title, total=total)
 
-        def update(done: float, total: float | None = None, title: str | None = None) -> None:
+        def update(done: float | None = None, total: float | None = None, title: str | None = None) -> None:
             progress.update(task, completed=done, total=total, description=title)
 
         yield update
@@ -47,7 +47,7 @@ def demo_progress(settings: Settings, update: Callable[..., None]) -> Callable[[
     def show(waiting_for: str, now: ProcessGroup) -> None:
         if waiting_for or now.telemetry is None:
             states = f" ({now.states})" if now.states and now.telemetry is None else ""
-            update(0, title=f"waiting for {waiting_for}{states}")
+            update(title=f"waiting for {waiting_for}{states}")
             return
         values = [
             f"error {degrees(angle(*now.telemetry.attitude_error)):5.2f}°",

@@ -50,10 +50,10 @@ def test_rows_into_a_pipe_are_not_folded_at_80_columns(capsys: pytest.CaptureFix
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
-def test_markdown_has_every_cell_and_numbers_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [{"law": "pd", "kbit/s": "1.0", "kind": "8 bits, uniform"}, {"law": "2", "kbit/s": "–", "kind": "x"}]
+def test_markdown_has_every_cell_and_numbers_but_no_sentences_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"law": "pd", "kbit/s": "1.0", "kind": "8 bits, uniform"}, {"law": "2", "kbit/s": "–", "kind": "2 samples"}]
     show_all([("laws", rows), ("a note", [])], "markdown")
-    table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | x |"]
+    table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | 2 samples |"]
     assert capsys.readouterr().out.splitlines() == ["**laws**", "", *table, "", "a note"]
 
 
