@@ -56,9 +56,7 @@ class TickSource:
     that of the link's arrivals.
     """
 
-    def __init__(
-        self, link: Link, loop: LoopSettings, wire: WireSpec, *, stale_s: float, clock: Clock = time
-    ) -> None:
+    def __init__(self, link: Link, loop: LoopSettings, wire: WireSpec, *, stale_s: float, clock: Clock = time) -> None:
         self._link = link
         self._clock = clock
         self._counter = wire.measurement.counter
