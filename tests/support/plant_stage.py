@@ -187,9 +187,6 @@ class Stage(PlantNetwork):
         if self.endpoint.session is None:
             self.wires.close()
 
-    def publish_status(self) -> None:
-        """Nothing to publish."""
-
     def leave(self) -> None:
         """As a ZenohNetwork does."""
         self.follow_session()
