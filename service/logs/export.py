@@ -26,7 +26,7 @@ from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, SessionKey, Unknown
-from aeroloop.service.logs.table import Column, Kind, columns_of, true_state
+from aeroloop.service.logs.table import Column, Kind, TrueStates, columns_of
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -171,25 +171,20 @@ def _pieces(
 
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
-    """True states of sessions in order: tick, attitude, rate, voltages; and how many messages are malformed."""
+    """Rows of the true states of some sessions, and how many messages are malformed."""
     actuators: dict[str, dict[str, int]] = {vehicle: {} for vehicle, _ in chosen}
-    for which in chosen:
-        actuators[which[0]][which[1]] = recording.settings(which).wire.actuators
-    found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
+    for vehicle, session in chosen:
+        actuators[vehicle][session] = recording.settings((vehicle, session)).wire.actuators
+    found = {vehicle: TrueStates(its) for vehicle, its in actuators.items()}
     malformed = 0
-    for vehicle, message in recording.messages(
-        lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in actuators else None
+    for states, message in recording.messages(
+        lambda address: found.get(address.vehicle) if address.topic.name == "truth" else None
     ):
         try:
-            true = true_state(message.data, actuators[vehicle])
+            states.add(message.data)
         except ValueError:
             malformed += 1
-            continue
-        if true is not None and true.session is not None and true.session_tick is not None:
-            row = true.session_tick, *true.attitude, *true.rate, *true.voltages
-            found[vehicle, true.session].append(row)
-    columns = {which: 8 + actuators[which[0]][which[1]] for which in chosen}
-    return {which: np.array(sorted(its)).reshape(-1, columns[which]) for which, its in found.items()}, malformed
+    return {which: found[which[0]].rows(which[1]) for which in chosen}, malformed
 
 
 # ── Files ──
