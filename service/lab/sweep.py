@@ -54,6 +54,21 @@ Progress: TypeAlias = Callable[[int, int], None]
 """Called with the number done and the number in all."""
 
 
+class Column(NamedTuple):
+    """A column of a printed table: a figure of a row as text."""
+
+    title: str
+    name: str
+    form: str  # as of `str.format`
+    scale: float = 1
+    missing: str = "–"
+
+    def text(self, row: Row) -> str:
+        """The cell of a row."""
+        value = row[self.name]
+        return self.missing if value is None else self.form.format(value * self.scale)
+
+
 class SweepError(AeroloopError):
     """Runs cannot begin or go on: no worker, another version, a file of rows in use; one line with the reason."""
 
