@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
-from itertools import groupby, product
+from itertools import cycle, groupby, product
 from math import inf
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -30,7 +30,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.baselines import TUNED, NonadaptiveSettings, Response, response_of, tuned
 from aeroloop.service.control.laws.interface import EstimateSettings
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
-from aeroloop.service.lab.burden import SENSORS, bits_of_text, chosen
+from aeroloop.service.lab.burden import SENSORS, bits_of_text, chosen, marks
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.sweep import (
     PROCESSES,
@@ -47,10 +47,6 @@ from aeroloop.service.lab.sweep import (
 from aeroloop.service.theorem.any_law import certify_any
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # ── what is compared ──
 
@@ -473,73 +469,49 @@ def draw_laws(laws: Laws, path: Path) -> None:
     in a row, with their periods. A law without figures has a cross. Raises OutputError if the file's name is wrong, or
     it cannot be written.
     """
-    from aeroloop.service.report.figure_style import figure_style, save_as
-
-    with figure_style():
-        save_as(_figure(laws), path)
-
-
-def _figure(laws: Laws) -> Figure:
     from matplotlib.figure import Figure
-
-    from aeroloop.service.report.figure_style import WIDTH_IN, logarithmic
-
-    place = itemgetter("plant", "sensors")
-    groups = {where: list(each) for where, each in groupby(sorted(laws.rows, key=place), place)}
-    kinds, bits = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits"))
-    height = 0.7 + len(groups) * (0.75 + 0.17 * len(kinds))
-    figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
-    panels = figure.subplots(len(groups), len(_PANELS) + 1, sharey=True, squeeze=False)
-    for line, ((plant, sensors), found) in zip(panels, groups.items(), strict=True):
-        for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
-            values = [factor * (row[name] or 0) for row in found]
-            if is_logarithmic and max(values) > 0:
-                logarithmic(panel, "x", (1, 2, 5))
-            for row, value in zip(found, values, strict=True):
-                _mark(panel, row, value, kinds.index(row["law"]), _SHAPES[bits.index(row["bits"]) % len(_SHAPES)])
-            panel.set_xlabel(label)
-        for margin in laws.margins:
-            if margin["plant"] == plant:
-                y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
-                for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
-                    line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
-        line[-1].set_xlabel("survived [ms]")
-        line[0].set_yticks(range(len(kinds)), kinds)
-        line[0].set_ylim(len(kinds) - 0.4, -0.6)
-        line[0].set_ylabel(f"{plant}, {sensors}")
-    figure.legend(handles=_legend(laws, bits), loc="outside lower center", ncols=6)
-    return figure
-
-
-def _colours() -> dict[str, str]:
-    from aeroloop.service.report.figure_style import BLUE, ORANGE
-
-    return {"calm": BLUE, "wind": ORANGE}
-
-
-def _mark(panel: Axes, row: Row, value: float, line: int, shape: str) -> None:
-    colour = _colours().get(row["wind"], "#222222")
-    y = line + 0.13 * (1 if row["wind"] == "wind" else -1)  # marks of one law that would cover each other
-    if row["reason"] is not None:
-        panel.plot(0.97, y, "x", color=colour, markersize=4, transform=panel.get_yaxis_transform())
-    else:
-        panel.plot(value, y, shape, color=colour, markersize=4, markerfacecolor="none", markeredgewidth=0.9)
-
-
-def _legend(laws: Laws, bits: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    winds = {name: colour for name, colour in _colours().items() if any(row["wind"] == name for row in laws.rows)}
-    hollow: dict[str, Any] = {"color": "0.4", "markerfacecolor": "none", "linestyle": "none", "markersize": 4}
-    bars = (("0.75", "delay"), ("white", "frames lost in a row"))
-    failed = [Line2D([], [], marker="x", label="did not last", **hollow)]
-    return [
-        *(Line2D([], [], color=colour, linewidth=4, label=name) for name, colour in winds.items()),
-        *(
-            Line2D([], [], marker=_SHAPES[i % len(_SHAPES)], label=f"{pair} bits", **hollow)
-            for i, pair in enumerate(bits)
-        ),
-        *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
-        *(failed if any(row["reason"] for row in laws.rows) else []),
-    ]
+    from aeroloop.service.report.figure_style import BLACK, BLUE, ORANGE, WIDTH_IN, figure_style, logarithmic, save_as
+
+    kinds, bits, winds = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits", "wind"))
+    shapes = dict(zip(bits, cycle(_SHAPES), strict=False))
+    colours = {wind: {"calm": BLUE, "wind": ORANGE}.get(wind, BLACK) for wind in winds}
+    places = dict.fromkeys((row["plant"], row["sensors"]) for row in laws.rows)
+    with figure_style():
+        height = 0.7 + len(places) * (0.75 + 0.17 * len(kinds))
+        figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
+        panels = figure.subplots(len(places), len(_PANELS) + 1, sharey=True, squeeze=False)
+        for line, place in zip(panels, places, strict=True):
+            found = [row for row in laws.rows if (row["plant"], row["sensors"]) == place]
+            for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
+                if is_logarithmic and any(row[name] for row in found):
+                    logarithmic(panel, "x", (1, 2, 5))
+                panel.set_xlabel(label)
+                for row in found:
+                    y = kinds.index(row["law"]) + (0.13 if row["wind"] == "wind" else -0.13)  # so that none is covered
+                    hollow = marks(colours[row["wind"]], face="none")
+                    if row["reason"] is not None:
+                        panel.plot(0.97, y, "x", transform=panel.get_yaxis_transform(), **hollow)
+                    else:
+                        panel.plot(row[name] * factor, y, shapes[row["bits"]], **hollow)
+            for margin in laws.margins:
+                if margin["plant"] == place[0]:
+                    y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
+                    for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
+                        line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
+            line[-1].set_xlabel("survived [ms]")
+            line[0].set_yticks(range(len(kinds)), kinds)
+            line[0].set_ylim(len(kinds) - 0.4, -0.6)
+            line[0].set_ylabel(", ".join(place))
+        bars = (("0.75", "delay"), ("white", "frames lost in a row"))
+        failed = ["did not last"] if any(row["reason"] for row in laws.rows) else []
+        legend = [
+            *(Line2D([], [], color=colour, linewidth=4, label=wind) for wind, colour in colours.items()),
+            *(Line2D([], [], marker=shape, label=f"{of} bits", **marks("0.4")) for of, shape in shapes.items()),
+            *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
+            *(Line2D([], [], marker="x", label=label, **marks("0.4")) for label in failed),
+        ]
+        figure.legend(handles=legend, loc="outside lower center", ncols=6)
+        save_as(figure, path)
