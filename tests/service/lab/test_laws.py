@@ -105,20 +105,8 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     run_here(monkeypatch)  # what workers bring back: test_workers.py
     out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
     laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
-    few = [
-        "--bits",
-        "8/6",
-        "--wind",
-        "calm",
-        "--plant",
-        "aero",
-        "--duration",
-        "3",
-        "--seeds",
-        "2",
-        "--set",
-        "loop.rate_hz=100",
-    ]
+    few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero"]
+    few += ["--duration", "3", "--seeds", "2", "--set", "loop.rate_hz=100"]
     assert execute(["lab", "laws", *laws, *few, "--out", str(out), "--figure", str(figure), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     pd, runaway, raising = found["rows"]
