@@ -19,8 +19,8 @@ from aeroloop.protocol.messages.trace import End
 from aeroloop.service.config import load
 from aeroloop.service.testing.hil import HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
-from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, RATE, Statuses, assert_whole
+from tests.support.zenoh_network import eventually
 
 LIBRARIES = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
 

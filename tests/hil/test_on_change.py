@@ -5,7 +5,6 @@ Most tests share one run in real time of a body at rest that an operator turns a
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +13,7 @@ from typing import NamedTuple
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.service.cli.main import execute
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.hil_log import RunFigures
 from tests.hil.test_faults import FAST_TRUTH, PATIENT, SLACK_S, WATCHDOG_S, last_command_ns, seconds_driven_after
@@ -106,26 +103,6 @@ def test_status_counts_the_frames_and_the_ticks_apart(run: Run) -> None:
     assert run.controller.rate_hz > 0.5 * RATE
     assert run.plant.received <= run.controller.sent + RATE  # reported up to a second apart
     assert run.plant.refused == run.controller.refused == 0
-
-
-def test_an_export_has_a_row_a_tick(run: Run, tmp_path: Path) -> None:
-    out = tmp_path / "a.csv"
-    assert execute(["log", "export", str(run.log.path), "--to", "csv", "--out", str(out)]) == 0
-    with out.open(newline="") as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    ticks = [int(row["tick"]) for row in rows]
-    assert ticks == sorted(set(ticks))
-    assert ticks == read(run.log.path).ticks.k.tolist()
-    assert len(ticks) > 0.5 * RATE * run.figures.duration_s
-
-
-def test_what_is_whole_of_a_log_that_was_cut_is_still_computed_again(run: Run, tmp_path: Path) -> None:
-    cut, out = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
-    content = run.log.path.read_bytes()
-    cut.write_bytes(content[: len(content) * 6 // 10])
-    assert execute(["log", "recover", str(cut), str(out)]) == 0
-    assert_replays(out, 1)
-    assert 0.2 < review(out).duration_s < run.figures.duration_s
 
 
 def moments(log: HilLog, kind: str) -> list[int]:

@@ -10,7 +10,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,22 +19,14 @@ from mcap.reader import make_reader
 from mcap.records import Channel
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Truth
-from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.config import load
-from aeroloop.service.host.operator import gather
+from aeroloop.protocol.messages.models import Event
 from aeroloop.service.logs.mcap_file import records
-from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.hil import HilLog
-from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
+from aeroloop.service.testing.process_group import free_rendezvous
+from tests.support.zenoh_network import eventually
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")
-
-START_S = 30.0
-"""Slack for starting processes: each takes about 1 s of CPU here, and CI may have other work."""
-
 
 PATIENT = ("--set", "plant.watchdog_s=2", "--set", "controller.stale_s=2", "--set", "wire.counter_bits=11")
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
@@ -59,14 +50,6 @@ def events(log: Path) -> list[Event]:
         ]
 
 
-def eventually(what: str, condition: Callable[[], bool], timeout_s: float = START_S) -> None:
-    """Wait for a condition that another process brings about."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"{what} did not happen within {timeout_s:g} s"
-        time.sleep(0.05)
-
-
 def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_review_those_of_the_demo(
     tmp_path: Path,
 ) -> None:
@@ -81,13 +64,6 @@ def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_re
     figures = {name: judged[name] for name in demo}
     figures["reasons"] = {name: why for name, why in judged["reasons"].items() if name in demo}
     assert figures == demo  # which has no age and holds nothing against the theorem
-
-
-def test_a_demo_in_lockstep_without_quantization_gives_the_experiments_figures_to_the_last_bit(tmp_path: Path) -> None:
-    cell = ("--duration", "1", "--bits-out", "cont", "--bits-in", "cont")
-    demo = aeroloop("demo", "--lockstep", "--log", str(tmp_path / "a.mcap"), *cell)
-    experiment = aeroloop("lab", "experiment", *cell)
-    assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
 
 
 def test_a_demo_in_real_time_tracks_and_two_run_beside_each_other(tmp_path: Path) -> None:
@@ -140,7 +116,6 @@ def parts(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
             started.append(subprocess.Popen(command, stderr=stderr))
         return started[-1]
 
-    start.rendezvous = rendezvous  # type: ignore[attr-defined]
     yield start
     for process in started:
         process.kill()
@@ -210,93 +185,4 @@ def test_a_loop_runs_over_unix_sockets(tmp_path: Path, parts: Callable[..., subp
     words = ("--set", network, "--set", "loop.lockstep=true")
     parts("emulator", *words)
     controller = parts("controller", "--auto-arm", "--duration", "0.5", *words)
-    assert controller.wait(START_S) == 0
-
-
-def test_a_second_controller_is_refused_by_name_and_a_controller_of_another_wire_by_field(
-    tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]
-) -> None:
-    parts("emulator")
-    parts("controller", "--auto-arm")
-    eventually("a session", said(tmp_path, "emulator", "granted to"))
-    parts("controller", "--auto-arm")
-    eventually("refusal by name", said(tmp_path, "controller", "the plant is held by controller-"))
-    parts("controller", "--auto-arm", "--set", "wire.rate.bits=10")
-    eventually("refusal by field", said(tmp_path, "controller", "rate.bits: 8, not 10"))
-
-
-def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchdog(tmp_path: Path) -> None:
-    log = tmp_path / "a.mcap"
-    settings = load(
-        overrides=[
-            f"network.rendezvous={free_rendezvous()}",
-            f"recorder.path={log}",
-            "controller.require_recorder=true",
-            "controller.auto_arm=true",
-            "controller.after_restart=configured",
-            "plant.truth_rate_hz=500",
-        ]
-    )
-    with ProcessGroup(settings) as processes:
-        processes.start("recorder")
-        processes.start("plant")
-        processes.await_role("recorder")
-        processes.await_role("plant")
-        commands: list[bytes] = []
-        processes.zenoh.declare_subscriber(
-            topics.key("command", settings.vehicle), lambda sample: commands.append(sample.payload.to_bytes())
-        )
-        processes.start("controller")
-        eventually("driving", lambda: len(commands) > 200)
-        processes.stop("controller", signal.SIGKILL)
-        time.sleep(0.5)  # five watchdogs, and all the time there is for a wrong plant to go on at its last command
-    last_command = max(HilLog(log).times("plant", "received"))
-    truths = [(at_ns, truth) for at_ns, truth in HilLog(log).messages("truth") if isinstance(truth, Truth)]
-    driven = [at_ns for at_ns, truth in truths if any(truth.voltages)]
-    # The watchdog's 100 ms; 100 ms of slack for a grid that is kept waiting by other work on the machine.
-    assert driven
-    assert max(driven) - last_command < 200_000_000
-    assert truths[-1][0] > max(driven)
-    assert any(event.kind == "tripped" for event in events(log))
-
-
-def test_an_operator_arms_looks_and_stops_and_no_controller_drives_before_the_plant_is_armed_again(
-    tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]
-) -> None:
-    parts("emulator", "--set", "plant.armed_at_start=false")
-    eventually("the emulator", said(tmp_path, "emulator", "waits for a claim"))
-    rendezvous = parts.rendezvous  # type: ignore[attr-defined]  # set by the fixture
-
-    def op(verb: str) -> str:
-        command = [*AEROLOOP, "op", verb, "--set", f"network.rendezvous={rendezvous}"]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-
-    def states() -> dict[str, str]:
-        statuses = gather(NetworkSettings(rendezvous=[rendezvous])).statuses["aero"]
-        return {role: status.state for role, status in statuses.items()}
-
-    parts("controller")
-    eventually("a refusal", said(tmp_path, "controller", "`aeroloop op arm` clears it"))
-    printed = aeroloop("op", "status", "--set", f"network.rendezvous={rendezvous}")["aero"]
-    assert {role: status["state"] for role, status in printed.items()} == {"plant": "idle", "controller": "searching"}
-    op("arm")
-    eventually("a session", said(tmp_path, "emulator", "granted to"))
-    eventually("driving", lambda: states() == {"plant": "driven", "controller": "running"})
-
-    op("stop")
-    eventually("0 V", said(tmp_path, "emulator", "stopped by an operator ("))
-    parts("controller", "--auto-arm")  # even one that may arm a plant does not arm this one
-    eventually("its refusal", said(tmp_path, "controller", "stopped by an operator"))
-    eventually("still", lambda: states()["plant"] == "tripped")
-    op("arm")
-    eventually("driving again", lambda: states()["plant"] == "driven")
-
-
-def test_what_is_not_a_log_is_refused_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    for content in (b"", b"not a log", b"\x89MCAP0\r\n" * 3):
-        path.write_bytes(content)
-        with pytest.raises(ReviewError) as refused:
-            review(path)
-        assert "\n" not in str(refused.value)
-        assert str(path) in str(refused.value)
+    assert controller.wait(30) == 0

@@ -26,9 +26,9 @@ from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
-from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually, grown
+from tests.hil.test_processes import AEROLOOP, aeroloop, events, grown
 from tests.support.cable import Cable
-from tests.support.zenoh_network import free_port
+from tests.support.zenoh_network import eventually, free_port
 
 RATE = 100
 """Slow, so that several of these tests run beside each other: most of their time they wait."""
