@@ -48,10 +48,12 @@ class Source:
         depth: int = MAILBOX,
         wire: WireSpec = WIRE,
         loop: LoopSettings = LOOP,
-        own_grid: bool = False,
+        grid_ns: int | None = None,  # begin of a grid of its own
         stale_s: float = 0.1,
     ) -> None:
         self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), depth)
+        self.link.pass_time(grid_ns or 0)
+        own_grid = grid_ns is not None
         self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s, clock=self.link)
         self.taken: list[tuple[PlantTick, int]] = []  # and when
 
@@ -195,8 +197,8 @@ def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost() -> None:
 def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(phase_ns: int, every: int) -> None:
     """Wherever in the plant's period it stands, but for its first tenth, and however often there is a frame."""
     last = 300
-    source = Source(heartbeats(last, {k: k % 5 for k in range(0, last, every)}), own_grid=True)
-    source.source._grid.start_ns = phase_ns + DELAY_NS  # type: ignore[union-attr]  # it has one
+    frames = heartbeats(last, {k: k % 5 for k in range(0, last, every)})
+    source = Source(frames, grid_ns=phase_ns + DELAY_NS)
     ticks = source.run(last * PERIOD_NS)
     assert len(source.ticks) > last - 5
     assert sorted(set(source.ticks)) == source.ticks
