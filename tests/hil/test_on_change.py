@@ -50,7 +50,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 def assert_replays(log: Path, at_least: int) -> None:
-    """Both ends replay byte for byte."""
     replayed = replay([log])
     for end in (replayed.controller, replayed.plant):
         assert end is not None, replayed.reasons

@@ -41,7 +41,6 @@ def aeroloop(*arguments: str) -> dict[str, Any]:
 
 
 def events(log: Path) -> list[Event]:
-    """The events in a log, in order."""
     with log.open("rb") as file:
         return [
             Event.model_validate_json(message.data)

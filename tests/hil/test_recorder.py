@@ -178,7 +178,6 @@ class Statuses:
         return status.state if status else None
 
     def ticks(self) -> int:
-        """Of the plant so far."""
         return self._last["plant"].ticks if "plant" in self._last else 0
 
 
@@ -230,7 +229,6 @@ class SmallDisk:
         self._ballast = Path(f"/proc/{self.pid}/root{self._disk}/ballast")
 
     def fill(self) -> None:
-        """Leave no room."""
         with self._ballast.open("wb", buffering=0) as file, suppress(OSError):
             while True:
                 file.write(bytes(4096))

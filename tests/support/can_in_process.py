@@ -79,7 +79,6 @@ class Stranger:
         return beat
 
     def everything(self) -> list[can.Message]:
-        """What has come and was not yet received."""
         return list(iter(lambda: self._bus.recv(0), None))
 
     def settle(self, *links: CanLink) -> None:
@@ -123,7 +122,6 @@ class FlawedBus(VirtualBus):
         super().__init__(channel, **options)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send, unless it is full or lost."""
         self._flaws.sent += 1
         if self._flaws.lost:
             raise OSError("no such device")
@@ -132,7 +130,6 @@ class FlawedBus(VirtualBus):
         super().send(msg, timeout)
 
     def shutdown(self) -> None:
-        """Close it."""
         self._flaws.closed += 1
         super().shutdown()
 

@@ -53,7 +53,6 @@ class HILError(Exception):
     """The board refuses a call or fails."""
 
     def get_error_message(self) -> str:
-        """Message of the error."""
         return str(self.args[0])
 
 
@@ -150,7 +149,6 @@ class FakeQuanser:
         return tuple(volts if on else 0.0 for volts, on in zip(self.analog, self.enabled, strict=True))
 
     def truth(self) -> State:
-        """The Aero's true state."""
         return self._plant.truth()
 
     def fail_next(self, call: str, n: int = 1) -> None:
@@ -167,18 +165,15 @@ class FakeQuanser:
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
-        """Let periods pass without a read."""
         for _ in range(periods):
             self.step()
 
     def set_counts(self, channel: int, count: int) -> None:
-        """Set an encoder's present count."""
         self._zeros[channel] = self._raw[channel] - count
 
     # ── the board ──
 
     def step(self) -> None:
-        """Let one period pass."""
         task = self.task
         if task is None or not task.running:
             raise MisuseError("no task runs, so there is no sample to wait for")
@@ -201,7 +196,6 @@ class FakeQuanser:
             self.step()
 
     def sample(self, encoders: Sequence[int], other: Sequence[int]) -> tuple[list[int], list[float]]:
-        """Present values of these channels."""
         counts = [self._raw[channel] - self._zeros[channel] for channel in encoders]
         gyro = self._plant.measure().rate
         return counts, [gyro[channel - 3000] if channel in range(3000, 3003) else 0.0 for channel in other]
@@ -219,12 +213,10 @@ class FakeQuanser:
             raise HILError(f"{name} was made to fail")
 
     def restore(self, outputs: dict[Kind, list[Any]]) -> None:
-        """Set outputs by their kind."""
         for kind, values in outputs.items():
             self.outputs[kind][:] = values
 
     def _check_watchdog(self) -> None:
-        """Let the watchdog expire if its time is over."""
         if self.watchdog is not None and not self.expired and self.time - self.reloaded >= self.watchdog:
             self.expired = True
             self.before_expiry = {kind: list(values) for kind, values in self.outputs.items()}
@@ -457,7 +449,6 @@ def _check_task(task: object) -> None:
 
 
 def _numbers(channels: Any, n: int, there: Sequence[int]) -> list[int]:
-    """Channel numbers, from an array that C can read."""
     if channels is None and n == 0:
         return []
     _require(type(n) is int and n >= 1, f"a number of channels is an int of 1 or more, not {n!r}")

@@ -53,7 +53,6 @@ def plant_of(board: FakeQuanser, settings: QuanserSettings = AERO.quanser) -> Qu
 
 
 def drive(plant: Plant, periods: int, voltages: tuple[float, float] = VOLTS) -> None:
-    """Command the voltages in each of these periods."""
     for _ in range(periods):
         plant.actuate(voltages)
         plant.advance()
@@ -83,7 +82,6 @@ def emulated_aero(settings: PlantSettings = AERO, counts: tuple[int, int] = (288
 
 
 def is_nothing(seen: Measurement) -> bool:
-    """Whether a measurement has no value at all."""
     return all(isnan(value) for value in (*seen.attitude, *seen.rate))
 
 
@@ -94,7 +92,6 @@ class Calls:
         self._board, self._before = board, len(board.calls)
 
     def names(self) -> list[str]:
-        """The names, in order."""
         return list(self._board.calls)[self._before :]
 
 

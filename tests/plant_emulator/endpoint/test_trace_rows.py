@@ -24,14 +24,12 @@ OFF = (0.0, 0.0)
 
 
 def answer(stage: Stage, measurement: bytes) -> None:
-    """At once, with the same voltages."""
     counter = stage.wire.measurement.counter(measurement)
     assert counter is not None
     stage.wires.deliver(stage.wire.command.pack(counter, (3, -3)), stage.endpoint.ticked)
 
 
 def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:
-    """Do this after these ticks."""
 
     def between(stage: Stage) -> None:
         if act := what.pop(stage.endpoint.ticked, None):
@@ -41,7 +39,6 @@ def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:
 
 
 def rows(batches: list[Batch], column: str) -> list[object]:
-    """A column of all batches."""
     return [value for batch in batches for value in batch.columns[column].tolist()]
 
 

@@ -193,7 +193,6 @@ BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]]
 
 
 def refusal(settings: FmuSettings) -> str:
-    """The line with which an FMU is refused."""
     with pytest.raises(FmuError) as refused:
         FmuPlant(settings, PERIOD)
     assert "\n" not in str(refused.value)

@@ -75,7 +75,6 @@ class Run(Stage):
 
     @property
     def events(self) -> list[Notice]:
-        """Events of begins and ends."""
         faults = [notice for notice in self.endpoint.notices if notice.kind == "fault"]
         return [notice for notice in faults if notice.text.startswith(("fault begins", "fault ends"))]
 

@@ -63,7 +63,6 @@ class Mischief:
         self._late = random.choice((0, 1, 3, 60))
 
     def skip(self) -> int:
-        """Now and then some ticks; seldom many."""
         random = self._random
         return random.choice((1, 2, 5, 70)) if random.random() < 0.01 else 0
 
@@ -120,7 +119,6 @@ class Mischief:
 
 
 def traced(seed: int) -> tuple[LoopSettings, WireSpec, PlantSettings, list[Batch]]:
-    """A loop that chance disturbs."""
     random = Random(seed)
     loop = LoopSettings(lockstep=random.random() < 0.3, realtime="off", trace_s=0.01)
     wire = random.choice(WIRES)

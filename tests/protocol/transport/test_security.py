@@ -124,7 +124,6 @@ def bare(certificate: Path | None, **tree: Any) -> Iterator[zenoh.Session]:
 
 
 def links(session: zenoh.Session) -> set[str | None]:
-    """Common names of a session's links."""
     return {link.auth_identifier for link in session.info.links()}
 
 

@@ -53,7 +53,6 @@ def bit_string(counter: int, counter_bits: int, widths: Widths, codes: Sequence[
 
 
 def codes_in(bits: str, counter_bits: int, widths: Widths) -> Iterator[float]:
-    """The codes in a string of bits."""
     at = -(-counter_bits // 8) * 8 if None in widths else counter_bits
     for width in widths:
         field = bits[at : at + (width or 64)]
@@ -65,7 +64,6 @@ def codes_in(bits: str, counter_bits: int, widths: Widths) -> Iterator[float]:
 
 
 def as_bytes(bits: str) -> bytes:
-    """Eight characters a byte."""
     return bytes(int(bits[i : i + 8], 2) for i in range(0, len(bits), 8))
 
 
@@ -95,7 +93,6 @@ def measured(spec: WireSpec) -> tuple[FrameFormat, Widths]:
 
 
 def commanded(spec: WireSpec) -> tuple[FrameFormat, Widths]:
-    """The same of a command."""
     return spec.command, (spec.voltage.bits,) * spec.actuators
 
 

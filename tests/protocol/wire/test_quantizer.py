@@ -275,7 +275,6 @@ def test_a_session_starts_without_a_memory_and_no_valid_value_leaves_it_alone() 
 
 
 def edges_by_decimals(quantizer: LogarithmicQuantizer) -> list[Decimal]:
-    """e₀ … e_N as SPEC.md defines them."""
     with localcontext() as context:
         context.prec = 50
         y0, yt, limit = (Decimal(y) for y in (quantizer.deadzone, quantizer.threshold, quantizer.limit))

@@ -22,7 +22,6 @@ def no_package() -> Iterator[None]:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> HandClock:
-    """The clock of plant and board."""
     hand = HandClock()
     monkeypatch.setattr(quanser_board, "time", hand)
     monkeypatch.setattr(fake_quanser, "time", hand)
