@@ -49,15 +49,18 @@ def events(log: Path) -> list[Event]:
         ]
 
 
+@pytest.mark.parametrize(
+    "cell", [["--bits-out", "cont", "--bits-in", "cont"], ["--set", "wire.transmit=on_change"], []]
+)
 def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_review_those_of_the_demo(
-    tmp_path: Path,
+    tmp_path: Path, cell: list[str]
 ) -> None:
     log, fault = tmp_path / "a.mcap", "rate:bias=0.01@0.5..1"
-    cell = ("--duration", "2", "--set", f'plant.faults=["{fault}"]')
+    cell = ["--duration", "2", "--set", f'plant.faults=["{fault}"]', *cell]
     demo = aeroloop("demo", "--lockstep", "--log", str(log), *cell)
     experiment = aeroloop("lab", "experiment", *cell)
     assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
-    assert demo["skipped_ticks"] == 0
+    assert (demo["skipped_ticks"], demo["trips"]) == (0, [])
     assert [(one["fault"], one["begin_s"], one["end_s"]) for one in demo["faults"]] == [(fault, 0.5, 1.0)]
     judged = aeroloop("log", "review", str(log))
     figures = {name: judged[name] for name in demo}

@@ -93,18 +93,3 @@ class Calls:
 
     def names(self) -> list[str]:
         return list(self._board.calls)[self._before :]
-
-
-class HandClock:
-    """Takes the place of the module `time`; sleeping takes no time but its own."""
-
-    def __init__(self) -> None:
-        self.ns = 10**9
-        self.slept: list[float] = []
-
-    def monotonic_ns(self) -> int:
-        return self.ns
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.ns += round(seconds * 1e9)
