@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Self
 from unittest.mock import patch
 
@@ -147,6 +147,12 @@ class Stage(PlantNetwork):
                 session=f"s{self._claims}",
             )
         )
+
+    def command(self, measurement: bytes, codes: Sequence[float]) -> None:
+        """Answer a measurement at once."""
+        counter = self.wire.measurement.counter(measurement)
+        assert counter is not None
+        self.wires.deliver(self.wire.command.pack(counter, codes), self.endpoint.ticked)
 
     @property
     def link(self) -> Link | None:

@@ -24,9 +24,7 @@ OFF = (0.0, 0.0)
 
 
 def answer(stage: Stage, measurement: bytes) -> None:
-    counter = stage.wire.measurement.counter(measurement)
-    assert counter is not None
-    stage.wires.deliver(stage.wire.command.pack(counter, (3, -3)), stage.endpoint.ticked)
+    stage.command(measurement, (3, -3))
 
 
 def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:

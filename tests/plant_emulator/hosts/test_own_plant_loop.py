@@ -31,10 +31,7 @@ def stage_of(kind: str, wire: WireSpec, own: dict[str, Any], faults: list[str], 
     count = iter(range(TICKS * 10))
 
     def answer(stage: Stage, frame: bytes) -> None:
-        counter = wire.measurement.counter(frame)
-        assert counter is not None
-        codes = [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)]
-        stage.wires.deliver(wire.command.pack(counter, codes), stage.endpoint.ticked)
+        stage.command(frame, [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)])
 
     def between(stage: Stage) -> None:
         if stage.endpoint.session is None and stage.endpoint.ticked < 0:  # once

@@ -148,12 +148,8 @@ def undisturbed() -> tuple[LoopSettings, WireSpec, list[Batch]]:
         if stage.endpoint.session is None and stage.endpoint.ticked < 10:
             stage.claim()
 
-    def answer(stage: Stage, measurement: bytes) -> None:
-        counter = wire.measurement.counter(measurement)
-        assert counter is not None
-        stage.wires.deliver(wire.command.pack(counter, (1, -1)), stage.endpoint.ticked)
-
-    return loop, wire, Stage(loop, wire, PLANT, between=claim, answer=answer).run(600).batches
+    stage = Stage(loop, wire, PLANT, between=claim, answer=lambda stage, frame: stage.command(frame, (1, -1)))
+    return loop, wire, stage.run(600).batches
 
 
 @settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.generate])
