@@ -10,7 +10,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ from mcap.records import Channel
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
+from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.process_group import free_rendezvous
+from aeroloop.service.testing.process_group import ProcessGroup
 from tests.support.zenoh_network import eventually
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
@@ -106,30 +107,6 @@ def test_interrupting_the_demo_ends_it_cleanly_with_a_readable_log(tmp_path: Pat
     assert last == {"plant": "stopped", "controller": "stopped", "recorder": "started"}
 
 
-@pytest.fixture
-def parts(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """Start a part by itself, as a user would, on a network of this test's own. Killed at the end if it still runs."""
-    rendezvous = free_rendezvous()
-    started: list[subprocess.Popen[bytes]] = []
-
-    def start(part: str, *arguments: str) -> subprocess.Popen[bytes]:
-        command = [*AEROLOOP, part, "--set", f"network.rendezvous={rendezvous}", *PATIENT, *arguments]
-        with (tmp_path / f"{part}-{len(started)}.stderr").open("wb") as stderr:
-            started.append(subprocess.Popen(command, stderr=stderr))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
-
-
-def stop(process: subprocess.Popen[bytes]) -> None:
-    """SIGTERM, and the clean end that must follow within 10 s (closing Zenoh and the log takes well under one)."""
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 0
-
-
 def grown(log: Path) -> Callable[[], bool]:
     """Whether a log holds a controller's trace; a chunk is closed every second."""
 
@@ -142,49 +119,11 @@ def grown(log: Path) -> Callable[[], bool]:
     return holds_ticks
 
 
-def said(folder: Path, part: str, text: str) -> Callable[[], bool]:
-    """Whether any process of this kind has said something on stderr."""
-    return lambda: any(text in path.read_text() for path in folder.glob(f"{part}-*.stderr"))
-
-
-def test_parts_start_in_any_order_and_find_each_other_after_each_is_restarted(
-    tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]
-) -> None:
-    def times_granted() -> int:
-        return sum(path.read_text().count("granted to") for path in tmp_path.glob("emulator-*.stderr"))
-
-    controller = parts("controller")
-    eventually("the controller", said(tmp_path, "controller", "looks for aero"))
-    emulator = parts("emulator")
-    eventually("a first session", lambda: times_granted() == 1)
-    recorder = parts("recorder", "--log", str(tmp_path / "a.mcap"))
-    eventually("the recorder", said(tmp_path, "recorder", "recording to"))
-
-    stop(emulator)
-    eventually("the controller's notice", said(tmp_path, "controller", "stopped commanding, looking for aero"))
-    emulator = parts("emulator")
-    eventually("a session with the new emulator", lambda: times_granted() == 2)
-
-    controller.kill()
-    controller.wait()
-    eventually("0 V", said(tmp_path, "emulator", "0 V"))
-    controller = parts("controller", "--auto-arm")
-    eventually("a session with the new controller", lambda: times_granted() == 3)
-
-    stop(recorder)
-    recorder = parts("recorder", "--log", str(tmp_path / "b.mcap"))
-    eventually("frames in the new log", grown(tmp_path / "b.mcap"))
-    for process in (controller, emulator, recorder):
-        stop(process)
-    assert review(tmp_path / "b.mcap").z_track is not None
-    for path in tmp_path.glob("*.stderr"):
-        assert "Traceback" not in path.read_text()
-
-
-def test_a_loop_runs_over_unix_sockets(tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]) -> None:
-    """Slack: in lockstep, and 30 s for two processes to start."""
-    network = "network.rendezvous=" + json.dumps([f"unixsock-stream/{tmp_path}/{i}" for i in range(2)])
-    words = ("--set", network, "--set", "loop.lockstep=true")
-    parts("emulator", *words)
-    controller = parts("controller", "--auto-arm", "--duration", "0.5", *words)
-    assert controller.wait(30) == 0
+def test_a_loop_runs_over_unix_sockets(tmp_path: Path) -> None:
+    places = json.dumps([f"unixsock-stream/{tmp_path}/{i}" for i in range(3)])
+    lockstep = ["loop.lockstep=true", "controller.auto_arm=true", "controller.duration_s=0.5"]
+    with ProcessGroup(load(overrides=[f"network.rendezvous={places}", *lockstep])) as processes:
+        processes.start("plant")
+        controller = processes.start("controller")
+        controller.join(30)  # for two processes to start
+        assert controller.exitcode == 0
