@@ -31,11 +31,7 @@ def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> C
 
 
 class Stranger:
-    """One more on the bus: sees every frame as it is, and says whatever a test wants. A context.
-
-    Args:
-        settings: The bus.
-    """
+    """One more on the bus: sees every frame as it is, and says whatever a test wants. A context."""
 
     def __init__(self, settings: CanSettings) -> None:
         self._node = settings.node
@@ -91,16 +87,7 @@ class Stranger:
 
 
 class Flaws:
-    """What is wrong with every `FlawedBus`, now.
-
-    Attributes:
-        full: No frame is taken.
-        lost: Neither sending nor receiving works.
-        gone: It cannot be opened.
-        opened: How often somebody tried to open one.
-        closed: How often somebody closed one.
-        sent: Frames that one was asked to take.
-    """
+    """What is wrong with every `FlawedBus` now: it takes no frame, is lost, cannot be opened; what was tried."""
 
     def __init__(self) -> None:
         self.full = self.lost = self.gone = False

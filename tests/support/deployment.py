@@ -32,14 +32,7 @@ AWAY_S: Final = 2.0
 
 
 class Outcome(NamedTuple):
-    """What a trouble cost.
-
-    Attributes:
-        title: What was done.
-        trips: How often the plant tripped.
-        rest_s: From its begin to the first trip, when the motors are at 0 V [s]; None without one.
-        again_s: From its end until the plant is driven and stays so [s]; None without a trip.
-    """
+    """What a trouble cost: trips, seconds to 0 V from its begin, seconds from its end until the plant stays driven."""
 
     title: str
     trips: int
@@ -54,11 +47,7 @@ class Outcome(NamedTuple):
 
 
 class Deployment(Hosts):
-    """Hosts of an example configuration, with a certificate each.
-
-    Attributes:
-        daemons: By host, once started.
-    """
+    """Hosts of an example configuration with a certificate each; `daemons` by host, once started."""
 
     def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
         super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")

@@ -90,23 +90,9 @@ class Task:
 class FakeQuanser:
     """A board with an emulated Aero on it, and the names of the module `quanser.hardware`.
 
-    Args:
-        settings: The Aero. Its joints have the card's encoders, and its IMU the gyro of `settings.sensors`.
-        period: Time between samples [s].
-        card_type: Type of the board, a key of BOARDS.
-        realtime: Whether samples fall due by the clock, or when they are read.
-
-    Attributes:
-        HIL: Makes a board's handle, as the class in the module does.
-        calls: Names of the last 10 000 calls.
-        time: Samples since the task was started.
-        analog: Voltages on the analog outputs [V].
-        enabled: 1 for each motor's amplifier that is on.
-        leds: Red, green, blue.
-        expired: Whether the watchdog has expired.
-        shorts: So many `task_read` return without a sample from now on.
-        reads_while_expired: Whether reads succeed after the watchdog has expired; the documentation is silent.
-        counts_overflows: Whether the board counts lost samples.
+    Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started. The
+    documentation is silent on whether reads succeed after the watchdog has expired (`reads_while_expired`), and not
+    every board counts lost samples (`counts_overflows`).
     """
 
     HILError = HILError

@@ -45,11 +45,7 @@ Ways = Literal["sent", "received", "both"]
 
 
 class Hosts:
-    """Hosts by name, each with an address and a cable. A context: leaving it ends their processes and removes them.
-
-    Attributes:
-        rendezvous: Zenoh endpoints, one for each host, for `network.rendezvous`.
-    """
+    """Hosts by name, each with an address and a cable. A context: leaving it ends their processes and removes them."""
 
     def __init__(self, names: Sequence[str], folder: Path, config: Path | None = None) -> None:
         self._folder = folder

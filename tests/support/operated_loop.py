@@ -110,14 +110,7 @@ class LonelyNode(Node):
 
 
 class Loop:
-    """What the daemon does around OperatorChanges, with a log of what a recorder would have kept.
-
-    Attributes:
-        clock: The fake clock of the node.
-        k: The next tick.
-        session: Name of the session, or "".
-        log: Of each session, its frames: (tick, measurement, command).
-    """
+    """What the daemon does around OperatorChanges; `log` has each session's ticks, measurements and commands."""
 
     def __init__(
         self,

@@ -77,21 +77,10 @@ class Grid:
 
 
 class Stage(PlantNetwork):
-    """Runs an emulator's driver to a tick.
+    """Runs a driver, an emulator's unless given, to a tick.
 
-    Args:
-        loop: The grid.
-        wire: What the frames are.
-        plant: The emulator.
-        between: Called between ticks.
-        answer: Called with every measurement that is sent; UNCHANGED in lockstep only.
-        skip: Ticks to skip before the next.
-        driver: Instead of an emulator.
-
-    Attributes:
-        batches: What was published.
-        driver: The driver; an Emulator unless one was given.
-        link: The wires, while a session runs.
+    `between` is called between ticks, `answer` with every measurement that is sent (UNCHANGED in lockstep only), and
+    `skip` gives the ticks to skip before the next. `sent` are the measurements, `wires` the way of the commands.
     """
 
     def __init__(

@@ -36,14 +36,7 @@ OURS = 4711
 
 
 class Made:
-    """A publisher and a subscriber, with a network between them that does what a test says.
-
-    Attributes:
-        now: Time of the subscriber's clock [s].
-        count: How many messages were published.
-        queries: Queries that are not answered yet, and what takes their answers.
-        found: Numbers that were delivered, in order.
-    """
+    """A publisher and a subscriber, with a network between them that does what a test says."""
 
     def __init__(self, kept: int, key: str = KEY, publisher: int = OURS, size: int = 0) -> None:
         self.now = 0.0
