@@ -207,17 +207,6 @@ def test_a_peer_without_tls_is_told_from_one_that_is_halted(network: Secured) ->
     assert refusal(f"tls/127.0.0.1:{free_port()}", mine) is None
 
 
-def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
-    from aeroloop.service.host.operator import OperatorError, gather
-
-    network.foreign.issue("operator")
-    theirs = network.settings.model_copy(
-        update={"security": SecuritySettings(directory=str(network.foreign.folder), vehicles=["aero"])}
-    )
-    with join(network.settings, PLANT), pytest.raises(OperatorError, match="not of this authority"):
-        gather(theirs)
-
-
 def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(network: Secured) -> None:
     nobody = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.authority.folder))})
     with pytest.raises(NetworkError, match="name them in"):
