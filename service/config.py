@@ -17,8 +17,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
-from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
 from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
@@ -179,16 +178,13 @@ def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     return from_description(tree)
 
 
-def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
-    """The settings with other bits: `bits_out` for ε and ω, `bits_in` for u; None leaves them unchanged.
-
-    Raises:
-        ConfigError: Not a number of bits, and not "cont".
-    """
-    overrides: list[str] = []
-    for bits, signals, option in ((bits_out, ("attitude", "rate"), "--bits-out"), (bits_in, ("voltage",), "--bits-in")):
-        if bits is not None:
-            if bits != "cont" and not (bits.isdecimal() and MIN_BITS <= int(bits) <= MAX_BITS):
-                raise ConfigError(f"{option} takes {MIN_BITS} to {MAX_BITS} bits or cont, not {bits!r}")
-            overrides += [f"wire.{signal}.bits={bits}" for signal in signals]
-    return load_over(settings, overrides)
+def with_bits(settings: Settings, text: str | None) -> Settings:
+    """The settings with other bits, as of `SignalBits.parse`; None leaves them unchanged. Raises ConfigError."""
+    if text is None:
+        return settings
+    try:
+        bits = SignalBits.parse(text)
+    except ValueError as error:
+        raise ConfigError(f"--bits: {error}") from None
+    words = ("cont" if each is None else each for each in bits)
+    return load_over(settings, [f"wire.{name}.bits={word}" for name, word in zip(bits._fields, words, strict=True)])

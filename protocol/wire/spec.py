@@ -7,7 +7,7 @@ transmit policy. Claims, fingerprints, frames, the DBC and log readers derive ev
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
@@ -35,6 +35,35 @@ FIRST_COMMAND_S: Final = 1.0
 def bits_or_continuous(value: object) -> object:
     """The word "cont" stands for no quantization in configuration (TOML has no null)."""
     return None if value == "cont" else value
+
+
+class SignalBits(NamedTuple):
+    """Bits of ε, ω and u; None is the paper's "cont."."""
+
+    attitude: int | None
+    rate: int | None
+    voltage: int | None
+
+    @classmethod
+    def parse(cls, text: str) -> SignalBits:
+        """Of three numbers, such as 10/6/6; of two, out and in as in the paper's tables, such as 8/6; of `cont`.
+
+        Raises:
+            ValueError: It is none of these, or a number is out of range.
+        """
+        words = ["cont"] * 3 if text == "cont" else text.split("/")
+        good = all(word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words)
+        if len(words) not in (2, 3) or not good:
+            raise ValueError(
+                f"bits are of attitude, rate and voltage, such as 10/6/6, or out and in, such as 8/6, each "
+                f"{MIN_BITS} to {MAX_BITS} or cont, not {text!r}"
+            )
+        out, *rest = (None if word == "cont" else int(word) for word in words)
+        return cls(out, out, rest[0]) if len(rest) == 1 else cls(out, *rest)
+
+    def __str__(self) -> str:
+        few = self[1:] if self.attitude == self.rate else self
+        return "/".join("cont" if bits is None else str(bits) for bits in few)
 
 
 _Number: TypeAlias = Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)]
@@ -147,16 +176,17 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns]."""
         return period_ns << self.counter_bits
 
-    def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
-        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
+    def with_bits(self, text: str) -> WireSpec:
+        """The same spec with other bits, as of `SignalBits.parse`: 10/6/6, 8/6, cont.
 
         Raises:
-            ValueError: The bits do not fit a signal's kind or its other parameters.
+            ValueError: The text has no bits, or they do not fit a signal's kind or its other parameters.
         """
+        bits = SignalBits.parse(text)
         return WireSpec(
-            attitude=self.attitude.with_bits(out),
-            rate=self.rate.with_bits(out),
-            voltage=self.voltage.with_bits(inp),
+            attitude=self.attitude.with_bits(bits.attitude),
+            rate=self.rate.with_bits(bits.rate),
+            voltage=self.voltage.with_bits(bits.voltage),
             actuators=self.actuators,
             transmit=self.transmit,
             counter_bits=self.counter_bits,

@@ -44,10 +44,15 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
 ]
 Duration = Annotated[float, typer.Option("--duration", metavar="S", min=0.01, help="Length of the experiment, in s.")]
-BitsOut = Annotated[
-    str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
+BitsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--bits",
+        metavar="ε/ω/u|OUT/IN",
+        help="Bits of attitude, rate and voltage, such as 10/6/6; out and in, such as 8/6; or cont.",
+        show_default=False,
+    ),
 ]
-BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
 EngineOption = Annotated[
     str,
     typer.Option(
@@ -111,12 +116,12 @@ def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleA
         return load_vehicle_address(config, overrides or ())
 
 
-def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
+def with_bits_of(settings: Settings, bits: str | None) -> Settings:
     """The settings with the bits given on the command line."""
     from aeroloop.service.config import with_bits
 
     with checked():
-        return with_bits(settings, bits_out, bits_in)
+        return with_bits(settings, bits)
 
 
 @contextmanager

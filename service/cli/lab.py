@@ -10,8 +10,7 @@ import typer
 
 from aeroloop.service.cli.common import (
     PAPER_DURATION_S,
-    BitsIn,
-    BitsOut,
+    BitsOption,
     Config,
     Duration,
     EngineOption,
@@ -65,14 +64,13 @@ _TABLE = "FILE.parquet|FILE.csv"
 
 def experiment(
     duration: Duration = PAPER_DURATION_S,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, in lockstep, without a network."""
-    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.display import figures_table, progress_bar
 
@@ -134,15 +132,14 @@ def certify(
             show_default=False,
         ),
     ] = None,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
-    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.terminal.show import show_result
     from aeroloop.service.theorem.any_law import certify_any
@@ -269,6 +266,7 @@ def sweep(
     ] = None,
     seeds: _Seeds = 1,
     duration: Duration = PAPER_DURATION_S,
+    bits: BitsOption = None,
     engine: EngineOption = "processes",
     force: Force = False,
     json: Json = False,
@@ -276,7 +274,7 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds, and write a table of their figures."""
-    settings = loop_of(config, overrides)
+    settings = with_bits_of(loop_of(config, overrides), bits)
     check_engine(engine)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, run_sweep, sheets
@@ -370,6 +368,44 @@ def tune(
     raise typer.Exit(INTERRUPTED if found.interrupted else 1 if found.worse else 0)
 
 
+def design(
+    error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
+    kbit: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="KBIT", help="Largest payload of both frames, in kbit/s.", show_default=False),
+    ] = None,
+    rates: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--rate", metavar="HZ", help="Rate; may be repeated; as configured if left out.", show_default=False
+        ),
+    ] = None,
+    gains: Annotated[bool, typer.Option("--gains", help="Search the law's gains, too.")] = False,
+    plant: Annotated[bool, typer.Option("--plant", help="Of the configured plant, not of the paper's body.")] = False,
+    delay: Annotated[float, typer.Option(min=0, metavar="S", help="Further delay of every command, in s.")] = 0.0,
+    loss: Annotated[int, typer.Option(min=0, metavar="N", help="Most frames lost in a row.")] = 0,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Search bits, rate and gains for the least payload whose error is proven."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab import design as lab
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.show import show_result
+
+    with guarded(), count_bar("designs", hidden=json) as update:
+        found = lab.design(
+            settings, error_deg=error, kbit=kbit, rates=rates or (), gains=gains, plant=plant, delay_s=delay, lost=loss,
+            duration_s=duration, progress=update, engine=engine,
+        )  # fmt: skip
+    show_result(found, lab.sheets, json=json, markdown=markdown)
+
+
 group = typer.Typer()
-for verb in (experiment, tables, calibrate, certify, burden, laws, sweep, tune):
+for verb in (experiment, tables, calibrate, certify, burden, laws, sweep, tune, design):
     group.command()(verb)

@@ -12,8 +12,7 @@ import typer
 
 from aeroloop.service.cli.common import (
     PAPER_DURATION_S,
-    BitsIn,
-    BitsOut,
+    BitsOption,
     Config,
     Duration,
     Json,
@@ -58,8 +57,7 @@ def demo(
         str | None,
         typer.Option("--via", metavar="emulator|can", help="Plant end to run.", show_default=False),
     ] = None,
-    bits_out: BitsOut = None,
-    bits_in: BitsIn = None,
+    bits: BitsOption = None,
     log: NewLog = None,
     json: Json = False,
     config: Config = None,
@@ -67,7 +65,7 @@ def demo(
 ) -> None:
     """Run the paper's experiment in three processes over Zenoh. Then review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
-    settings = with_bits_of(loop_of(config, overrides, *options), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides, *options), bits)
     from aeroloop.service.lab.demo import run_demo
     from aeroloop.service.terminal.display import live_demo
     from aeroloop.service.terminal.log_tables import demo_account

@@ -25,8 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.transport.can_format import CLASSIC_BYTES
 from aeroloop.protocol.wire.frames import MIN_COUNTER_BITS, FrameFormat
-from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import Kind, SignalBits, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Policy, Transmit
 from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
@@ -40,10 +39,8 @@ if TYPE_CHECKING:
 
 # ── the grid ──
 
-_Bits = tuple[int | None, int | None]  # out and in; None is float64
-
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
-FLOAT64: Final = (None, None)
+FLOAT64: Final = SignalBits(None, None, None)
 QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
     **{kind: (kind, kind, kind) for kind in get_args(Kind)},
     "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
@@ -87,7 +84,8 @@ SENSORS: Final = {
 class BurdenCell(NamedTuple):
     """One experiment. Bits of None are float64; the quantizer is None where nothing is quantized."""
 
-    bits_out: int | None
+    bits_out: int | None  # of ε
+    bits_rate: int | None
     bits_in: int | None
     quantizer: str | None
     sensors: str
@@ -100,7 +98,7 @@ def grid(
 
     Args:
         settings: The configuration.
-        bits: Bits out and in, such as 8/6; `cont` for float64.
+        bits: Such as 8/6 or 10/6/6; `cont` for float64.
         quantizers: Names out of QUANTIZERS.
         sensors: Names out of SENSORS.
 
@@ -109,10 +107,10 @@ def grid(
     """
     if settings.plant.ideal:
         raise GridError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
-    pairs = [pair for pair in dict.fromkeys(bits_pair(text) for text in bits or BITS) if pair != FLOAT64]
+    pairs = [pair for pair in dict.fromkeys(map(bits_of_text, bits or BITS)) if pair != FLOAT64]
     kinds = chosen("--quantizer", quantizers, QUANTIZERS)
     levels = chosen("--sensors", sensors, SENSORS)
-    choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
+    choices: list[tuple[SignalBits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
     cells = [BurdenCell(*pair, kind, level) for level in levels for pair, kind in choices]
     for cell in cells:
         cell_settings(settings, cell)
@@ -127,7 +125,7 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
     """
     wire, plant = settings.wire, settings.plant
     kinds = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
-    signals = {"attitude": cell.bits_out, "rate": cell.bits_out, "voltage": cell.bits_in}
+    signals = {"attitude": cell.bits_out, "rate": cell.bits_rate, "voltage": cell.bits_in}
     try:
         chosen = WireSpec(
             **{
@@ -142,7 +140,7 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
     except ValidationError as error:
         why = problem(error, SignalSpec, WireSpec, type(plant))
-        name = f"{bits_text(cell.bits_out, cell.bits_in)} {cell.quantizer or 'float64'}"
+        name = f"{SignalBits(*cell[:3])} {cell.quantizer or 'float64'}"
         raise GridError(f"{name} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})
 
@@ -154,20 +152,12 @@ def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> Signa
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
 
 
-def bits_text(*bits: int | None) -> str:
-    """Bits out and in as a text, such as 8/6."""
-    return "/".join("cont" if each is None else str(each) for each in bits)
-
-
-def bits_pair(text: str) -> _Bits:
-    """Bits out and in of a text such as 8/6, cont or 8/cont. Raises GridError."""
-    words = text.split("/") if text != "cont" else [text] * 2
-    if len(words) != 2 or not all(
-        word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words
-    ):
-        raise GridError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
-    out, inp = (None if word == "cont" else int(word) for word in words)
-    return out, inp
+def bits_of_text(text: str) -> SignalBits:
+    """Bits as `--bits` takes them, such as 8/6, 10/6/6 or cont. Raises GridError."""
+    try:
+        return SignalBits.parse(text)
+    except ValueError as error:
+        raise GridError(f"--bits: {error}") from None
 
 
 def chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
@@ -339,8 +329,8 @@ def _is_baseline(point: Row) -> bool:
 
 
 def bits_of(point: Row) -> str:
-    """Bits out and in, as `--bits` takes them."""
-    return bits_text(point["bits_out"], point["bits_in"])
+    """Bits as `--bits` takes them."""
+    return str(SignalBits(point["bits_out"], point["bits_rate"], point["bits_in"]))
 
 
 # ── as text ──

@@ -35,7 +35,7 @@ from aeroloop.service.control.laws.baselines import (
     tuned,
 )
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
-from aeroloop.service.lab.burden import SENSORS, bits_pair, bits_text, chosen
+from aeroloop.service.lab.burden import SENSORS, bits_of_text, chosen
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.sweep import (
     PROCESSES,
@@ -104,7 +104,7 @@ def compare(
     Args:
         settings: The configuration.
         laws: Kinds of laws, also of one's own.
-        bits: Bits out and in, such as 8/6; `cont` for float64.
+        bits: Such as 8/6 or 10/6/6; `cont` for float64.
         sensors: Names out of SENSORS.
         winds: Names out of WINDS.
         plants: Kinds of plants, also of one's own.
@@ -119,7 +119,7 @@ def compare(
     found = list[tuple[Choice, Configuration]]()
     bodies = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
     levels, airs = chosen("--sensors", sensors or ("encoders",), SENSORS), chosen("--wind", winds, WINDS)
-    pairs = dict.fromkeys(bits_text(*bits_pair(text)) for text in bits or BITS)
+    pairs = dict.fromkeys(str(bits_of_text(text)) for text in bits or BITS)
     for plant, sensor, wind, pair in product(dict.fromkeys(bodies), levels, airs, pairs):
         for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
             choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
@@ -135,12 +135,10 @@ def compare(
 
 def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]]:
     """A combination as it can be had, and its overrides: a body without joints has no encoders."""
-    out, inp = bits_pair(choice.bits)
+    bits = bits_of_text(choice.bits)
     changes: dict[str, Any] = {
         "wire": {
-            "attitude": {"bits": out},
-            "rate": {"bits": out},
-            "voltage": {"bits": inp},
+            **{name: {"bits": each} for name, each in bits._asdict().items()},
             "transmit": {"measurement": "on_change", "command": "on_change"},
         },
         "plant": {"kind": choice.plant},

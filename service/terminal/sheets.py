@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aeroloop.service.theorem.certificate import Certificate
 
 DECIDING: Final = (
-    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "τ_h of the plant"
+    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "‖w_q‖", "τ_h of the plant"
 )  # fmt: skip
 """Symbols of a certificate's terms that are shown unless --verbose: what goes in, what decides, what comes out."""
 MARKS: Final = {"✓": "green", "✗": "bold red"}

@@ -52,6 +52,7 @@ class Premises:
         period: Of the loop [s].
         age: Longest time from a measurement to the end of its command's effect, without the rotors' lag [s].
         k_tau_d: Largest disturbance torque [N·m].
+        steady: Largest torque beside it that changes only as the body turns [N·m].
         tilt: Largest pitch of the reference if the body's roll is held by a mechanism; None if three motors act [rad].
         lag: Time constant of the rotors [s]; 0 without.
         uneven: Of a lag that differs up and down: share of a torque's lagging part by which the rotors err [1].
@@ -74,6 +75,7 @@ class Premises:
     period: float
     age: float
     k_tau_d: float
+    steady: float
     tilt: float | None
     lag: float = 0.0
     uneven: float = 0.0
@@ -207,9 +209,9 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     if not pitch < pi / 2:
         return None
     phi, sine = cos(pitch) ** 2, sin(pitch)
-    # The slow torque: −diag(R_d ω_d) θ̃, and with a held roll what u₁ should have added to the yaw.
+    # The slow torque: −diag(R_d ω_d) θ̃, what is steady, and with a held roll what u₁ should have added to the yaw.
     roll = (law.estimate * p.k_omega_d + j * p.k_omega_d_dot + p.weight_roll) if held else 0.0
-    push = law.theta_error * p.axis_rate + sine * roll
+    push = law.theta_error * p.axis_rate + p.steady + sine * roll
     slow = push / phi
     needed = at["eps"] + linear.eps * slow
     eps_e = max(eps_e, needed)
@@ -270,7 +272,7 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         hold += (p.age + p.lag) * law.reach * share * omega_e / 2
 
     # What drives the linear equations.
-    push_dot = law.theta_error * p.k_omega_d_dot + p.axis_rate * theta_dot
+    push_dot = law.theta_error * p.k_omega_d_dot + p.axis_rate * theta_dot + p.steady * omega
     d2 = fast + (law.radius if law.virtual else law.theta_error) * omega_e  # θ̃ acts on ω_e
     if p.tilt is not None:
         fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)

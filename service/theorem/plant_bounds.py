@@ -59,7 +59,8 @@ class PlantBounds:
         delta_eps: Largest |ε_k| by which the attitude sensor errs [1].
         delta_omega: Largest ‖ω‖ by which a gyro errs [rad/s].
         encoder: Errors of a rate by encoders.
-        torque: Largest torque of friction, dead zone, wind and a model that differs [N·m].
+        torque: Largest torque of friction, dead zone, gusts and motors that differ from the law's [N·m].
+        steady: Largest torque that changes only as the body turns: steady wind, a weight that differs [N·m].
         theta: θ, if the plant's damping is known [N·m·s/rad].
         held_roll: Whether a mechanism holds the roll, so that u₁ is never applied.
         assumed: What is assumed of it, each with its key.
@@ -73,6 +74,7 @@ class PlantBounds:
     delta_omega: float = 0.0
     encoder: EncoderRate = NO_ENCODER
     torque: float = 0.0
+    steady: float = 0.0
     theta: Vector | None = None
     held_roll: bool = False
     assumed: list[str] = field(default_factory=list)
@@ -110,7 +112,7 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
     held = plant.kind == "aero"
     aero = IDEAL_AERO if plant.ideal else plant.aero
     body = aero if held else plant.rigid_body
-    torque = body.gravity * hypot(
+    steady = body.gravity * hypot(
         *(body.mass * a - law.mass * b for a, b in zip(body.centre_of_mass, law.centre_of_mass, strict=True))
     )
     if body.gravity != law.gravity or body.inertia != law.inertia:
@@ -118,11 +120,12 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
     B = np.array(law.allocation)[1:, 1:] if held else np.array(law.allocation)
     applied = np.array(aero.thrust) if isinstance(body, AeroSettings) else np.array(plant.rigid_body.allocation)
     motors = len(B)
-    torque += float(np.linalg.norm(applied - B, 2)) * sqrt(motors) * plant.voltage_limit
+    torque = float(np.linalg.norm(applied - B, 2)) * sqrt(motors) * plant.voltage_limit
     if plant.faults:
         unproven.append("plant.faults are no part of any theorem")
     if plant.ideal:
-        return PlantBounds(age, torque=torque, theta=body.damping, held_roll=held, assumed=assumed, unproven=unproven)
+        known = PlantBounds(age, torque=torque, steady=steady, theta=body.damping, held_roll=held)
+        return replace(known, assumed=assumed, unproven=unproven)
 
     lag, uneven = _rotors(plant.rotor, B)
     if lag:
@@ -130,12 +133,21 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
     torque += float(np.linalg.norm(applied, 2)) * sqrt(motors) * plant.rotor.dead_zone_v
     torque += hypot(*plant.friction.coulomb)
     if plant.wind.blowing:
-        torque += hypot(*plant.wind.torque) * (1 + DEVIATIONS * plant.wind.gust)
+        steady += (blows := hypot(*plant.wind.torque))
+        torque += blows * DEVIATIONS * plant.wind.gust
         assumed.append(f"gusts stay within {DEVIATIONS} standard deviations (plant.wind.gust)")
     return _with_sensors(
         plant.sensors,
         PlantBounds(
-            age, lag, uneven, torque=torque, theta=_damping(plant), held_roll=held, assumed=assumed, unproven=unproven
+            age,
+            lag,
+            uneven,
+            torque=torque,
+            steady=steady,
+            theta=_damping(plant),
+            held_roll=held,
+            assumed=assumed,
+            unproven=unproven,
         ),
     )
 

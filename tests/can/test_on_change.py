@@ -33,7 +33,7 @@ BOTH = wire_of("on_change", "on_change")
     ("wire", "fd"),
     [
         (WireSpec(), False),
-        (WireSpec().with_bits(12, 16), True),
+        (WireSpec().with_bits("12/16"), True),
         *((wire_of(*policies), False) for policies in POLICIES),
     ],
     ids=["classic", "FD", *map("-".join, POLICIES)],

@@ -41,7 +41,7 @@ def test_frames_cross_on_a_real_socketcan() -> None:
     assert "skipped" not in done.stdout, done.stdout
 
 
-WIRES = {False: WireSpec(), True: WireSpec().with_bits(12, 16)}
+WIRES = {False: WireSpec(), True: WireSpec().with_bits("12/16")}
 """For classic CAN, of 7 and 2 bytes; for CAN FD, of 10, which travel as 12, and 5."""
 
 

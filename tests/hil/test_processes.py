@@ -50,9 +50,7 @@ def events(log: Path) -> list[Event]:
         ]
 
 
-@pytest.mark.parametrize(
-    "cell", [["--bits-out", "cont", "--bits-in", "cont"], ["--set", "wire.transmit=on_change"], []]
-)
+@pytest.mark.parametrize("cell", [["--bits", "cont"], ["--set", "wire.transmit=on_change"], []])
 def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_review_those_of_the_demo(
     tmp_path: Path, cell: list[str]
 ) -> None:

@@ -55,7 +55,7 @@ def cost_aside(figures: Figures) -> Figures:
 def test_in_lockstep_the_figures_are_those_of_a_frame_every_tick(
     loop: str, out: str, inp: str, measurement: Policy, command: Policy
 ) -> None:
-    settings = with_bits(LOOPS[loop], out, inp)
+    settings = with_bits(LOOPS[loop], f"{out}/{inp}")
     periodic = run_experiment(settings, DURATION)
     sparse = run_experiment(sending(settings, measurement, command), DURATION)
     assert cost_aside(sparse) == cost_aside(periodic)

@@ -64,8 +64,8 @@ def test_the_experiment_runs_repeats_and_is_not_that_of_the_uniform_kind(kind: s
 
 @other_kinds
 def test_more_bits_bring_every_kind_to_the_loop_without_quantization(kind: str) -> None:
-    fine = run_experiment(with_bits(throughout(kind), "16", "16"), 5.0)
-    continuous = run_experiment(with_bits(throughout(kind), "cont", "cont"), 5.0)
+    fine = run_experiment(with_bits(throughout(kind), "16/16"), 5.0)
+    continuous = run_experiment(with_bits(throughout(kind), "cont/cont"), 5.0)
     # 16 bits err by 3e-5 at the most, against an ε̃ of 1e-2: a few parts in a thousand.
     assert fine.z_track == pytest.approx(continuous.z_track, rel=5e-3)
     assert fine.u_total == pytest.approx(continuous.u_total, rel=5e-3)
@@ -186,7 +186,7 @@ def test_what_a_kind_does_not_take_is_reported_in_one_line_that_names_the_signal
 
 
 def test_bits_on_the_command_line_are_refused_as_those_in_the_configuration(capfd: pytest.CaptureFixture[str]) -> None:
-    command = ["lab", "experiment", "--set", "wire.rate.kind=logarithmic-uniform", "--bits-out", "2"]
+    command = ["lab", "experiment", "--set", "wire.rate.kind=logarithmic-uniform", "--bits", "2/6"]
     assert run(command) == 2
     assert capfd.readouterr().err == (
         "aeroloop: wire.rate: a logarithmic-uniform quantizer has at least 3 bits, not 2\n"

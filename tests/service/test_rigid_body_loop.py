@@ -144,7 +144,7 @@ def _started(settings: Settings, q: Array, omega: Array) -> Settings:
 @cache
 def _through_full_turns(bits: str) -> Run:
     """From the reference's own attitude and rate at t = 0, so that there is nothing to settle."""
-    settings = with_bits(OTHER, bits, bits)
+    settings = with_bits(OTHER, f"{bits}/{bits}")
     q_d, omega_d, _ = _desired(0)
     return _run(_started(settings, q_d, omega_d), 0, SECONDS)
 
@@ -363,7 +363,7 @@ AWAY = radians(60)
 
 def _from_behind(bits: str, seconds: float, sign: float = 1.0) -> Run:
     """From where q_d has its smallest η, with q of η ≥ 0 as received: η̃ < 0. `sign` is that of the plant's own q."""
-    settings = with_bits(OTHER, bits, bits)
+    settings = with_bits(OTHER, f"{bits}/{bits}")
     first = min(range(settings.loop.ticks(SECONDS)), key=lambda k: float(_desired(k)[0][0]))
     q_d, omega_d, _ = _desired(first)
     away = np.append(cos(AWAY / 2), sin(AWAY / 2) * np.array([1, 2, -2]) / 3)

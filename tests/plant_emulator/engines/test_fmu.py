@@ -78,7 +78,7 @@ def test_our_aero_as_an_fmu_moves_as_our_emulated_one_along_the_papers_experimen
 
     1e-12 leaves room for another compiler's library of sines; without closed loop, nothing grows faster than the time.
     """
-    course = experiment(with_bits(load(overrides=["plant.ideal=true"]), "8", "6"), 50.0).course
+    course = experiment(with_bits(load(overrides=["plant.ideal=true"]), "8/6"), 50.0).course
     voltages = [(float(u2), float(u3)) for u2, u3 in course.voltages]
     ours = flat(driven(IDEAL.build(PERIOD), voltages))
     assert np.ptp(ours[:, 3]) > 0.1  # it does move: this is sin(ψ/2) cos(θ/2)
@@ -289,7 +289,7 @@ def test_settings_that_contradict_each_other_are_refused(changes: dict[str, Any]
 
 @pytest.mark.parametrize("mapping", BODY)
 def test_an_experiment_gives_the_figures_of_our_ideal_aero(fmus: dict[str, Path], mapping: str) -> None:
-    settings = with_bits(load(overrides=["plant.ideal=true"]), "cont", "cont")
+    settings = with_bits(load(overrides=["plant.ideal=true"]), "cont")
     own = {"file": str(fmus[mapping]), "voltages": VOLTAGES, **BODY[mapping]}
     theirs = run_experiment(settings.model_copy(update={"plant": PlantSettings(kind="fmu", own=own)}), 4.0)
     ours = run_experiment(settings, 4.0)

@@ -47,7 +47,7 @@ FAULTS = (
 WIRES = (
     WireSpec(),
     WireSpec(transmit=Transmit(measurement="on_change", command="on_change")),
-    WireSpec(counter_bits=12).with_bits(None, None),
+    WireSpec(counter_bits=12).with_bits("cont/cont"),
     WireSpec(rate=SignalSpec(bits=6, limit=2.0, kind="hysteresis-uniform"), counter_bits=7),
 )
 PLANT = PlantSettings(wind=WindSettings(blowing=True), answer_timeout_s=1e-9)
@@ -210,7 +210,7 @@ def test_it_stops_with_the_reason_where_it_cannot_follow() -> None:
     loop, wire, batches = undisturbed()
     with_rows = [i for i, batch in enumerate(batches) if batch.header.rows]
     second, other = with_rows[1], batches[0]._replace(header=batches[0].header._replace(run=1))
-    wider = WireSpec().with_bits(10, 10)
+    wider = WireSpec().with_bits("10/10")
     stops: tuple[tuple[WireSpec, list[Batch], int, str], ...] = (
         (wire, batches[:second] + batches[second + 1 :], 256, "256 rows are missing after row 255 of the plant"),
         (wire, batches[second:], 0, "the log lacks the plant's first row, so the plant's state is not known"),

@@ -126,5 +126,5 @@ def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on()
         other = PAPER.model_dump()
         (other[section] if section else other).update(value if isinstance(value, dict) else {field: value})
         seen.add(fingerprint(WireSpec.model_validate(other), PERIOD_NS, lockstep=False))
-    seen.add(fingerprint(PAPER.with_bits(None, 6), PERIOD_NS, lockstep=False))
+    seen.add(fingerprint(PAPER.with_bits("cont/6"), PERIOD_NS, lockstep=False))
     assert len(seen) == 4 + len(plain) + 1

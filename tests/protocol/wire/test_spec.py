@@ -12,7 +12,7 @@ from aeroloop.protocol.wire.quantizer import (
     Continuous,
     UniformQuantizer,
 )
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import SignalBits, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Transmit
 from tests.support.wires import any_width, signals, specs, wire_of, wires
 
@@ -121,19 +121,23 @@ def test_two_wires_differ_by_every_field_and_both_values(
     assert ours.differences(theirs) == differences
 
 
-@given(wires, any_width, any_width)
-def test_with_bits_changes_the_bits_and_nothing_else(spec: WireSpec, out: int | None, inp: int | None) -> None:
-    changed = spec.with_bits(out, inp)
-    assert (changed.attitude.bits, changed.rate.bits, changed.voltage.bits) == (out, out, inp)
+@given(wires, any_width, any_width, any_width)
+def test_with_bits_changes_the_bits_and_nothing_else(
+    spec: WireSpec, a: int | None, b: int | None, u: int | None
+) -> None:
+    bits = SignalBits(a, b, u)
+    assert SignalBits.parse(str(bits)) == bits
+    changed = spec.with_bits(str(bits))
+    assert SignalBits(changed.attitude.bits, changed.rate.bits, changed.voltage.bits) == bits
     assert all(".bits:" in line for line in changed.differences(spec))
 
 
 def test_other_bits_keep_the_kind_and_are_refused_where_it_takes_none_such() -> None:
     wire = WireSpec(rate=SignalSpec(bits=8, limit=1.0, kind="logarithmic-uniform", threshold=0.2))
-    assert wire.with_bits(10, 6).rate == wire.rate.model_copy(update={"bits": 10})
-    assert wire.with_bits(None, 6).with_bits(8, 6) == wire
+    assert wire.with_bits("10/6").rate == wire.rate.model_copy(update={"bits": 10})
+    assert wire.with_bits("cont/6").with_bits("8/6") == wire
     with pytest.raises(ValueError, match=r"^a logarithmic-uniform quantizer has at least 3 bits, not 2$"):
-        wire.with_bits(2, 6)
+        wire.with_bits("2/6")
 
 
 def test_the_agreement_leaves_out_what_is_not_in_use() -> None:
@@ -147,3 +151,9 @@ def test_the_agreement_leaves_out_what_is_not_in_use() -> None:
     }  # fmt: skip
     assert WireSpec.model_validate(published) == wire
     assert "transmit" not in WireSpec().agreed()
+
+
+@pytest.mark.parametrize("text", ["8", "8/6/4/2", "8/1", "17/6", "8/6/", "a/b", ""])
+def test_bits_are_two_or_three_numbers_in_range(text: str) -> None:
+    with pytest.raises(ValueError, match="such as 10/6/6"):
+        SignalBits.parse(text)

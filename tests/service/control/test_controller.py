@@ -34,7 +34,7 @@ LEVEL = Sinusoid(amplitude=(0.0, 0.0, 0.0))
 """Hold q_d = [1, 0, 0, 0]."""
 
 QUANTIZED = WireSpec()
-CONTINUOUS = WireSpec().with_bits(None, None)
+CONTINUOUS = WireSpec().with_bits("cont/cont")
 AT_REST: Vector = (0.0, 0.0, 0.0)
 
 

@@ -89,7 +89,7 @@ def test_parameters_of_one_quantizer_are_not_anothers() -> None:
     ("arguments", "names"),
     [
         (("--bits", "8/1"), "8/1"),
-        (("--bits", "8/6/4"), "8/6/4"),
+        (("--bits", "8/6/4/2"), "8/6/4/2"),
         (("--bits", "8"), "'8'"),
         (("--quantizer", "round"), "round"),
         (("--sensors", "ear"), "ear"),

@@ -69,7 +69,7 @@ def test_others_have_the_response_that_the_configured_gains_give_and_a_configure
     [
         ({"sensors": ["radar"]}, "--sensors takes .*, not 'radar'"),
         ({"winds": ["storm"]}, "--wind takes calm, wind, not 'storm'"),
-        ({"bits": ["8"]}, "--bits takes bits out and in"),
+        ({"bits": ["8"]}, "such as 10/6/6"),
     ],
 )
 def test_an_unknown_choice_is_one_line(given: dict[str, Any], text: str) -> None:

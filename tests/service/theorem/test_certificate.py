@@ -194,6 +194,24 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
     assert found.plant_radius is None
 
 
+def test_an_integral_is_disturbed_only_by_what_changes() -> None:
+    """2 mN·m of wind that stays, on a free body that hardly turns."""
+    slow = ["plant.ideal=false", "plant.rotor.lag_up_s=0", "plant.rotor.lag_down_s=0", "plant.friction.viscous=[]",
+            "plant.friction.coulomb=[]", "plant.sensors.attitude=perfect", "plant.sensors.rate=perfect",
+            "plant.wind.torque=[0, 0.002, 0]", "plant.wind.gust=0", "reference.frequency=[0, 0.01, 0.005]"]  # fmt: skip
+    grown = {}
+    for kind in ("pd", "pid"):
+        calm, windy = (
+            certify(certified_settings(14, 14, f"law.kind={kind}", *slow, f"plant.wind.blowing={blows}"), margins=False)
+            for blows in ("false", "true")
+        )
+        assert calm.plant_radius is not None
+        assert windy.plant_radius is not None
+        grown[kind] = windy.plant_radius / calm.plant_radius
+    assert grown["pid"] < 1.1  # what turns
+    assert grown["pd"] > 1.5
+
+
 def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
     for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), certified_settings(3, 3)):
         found = certify(settings)
@@ -257,7 +275,7 @@ def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     """The correction of (C.66), against random errors: z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃ ≥ c₀ ‖z₁‖², and c₀ is all but attained."""
     law = AdaptiveSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
     most = radians(100)
-    settings = Settings(wire=PAPER.wire.with_bits(None, None), law=law, reference=STILL)
+    settings = Settings(wire=PAPER.wire.with_bits("cont"), law=law, reference=STILL)
     c0 = theorem_of(evaluate(settings, attitude_error_deg=degrees(most))).c0
     rng = np.random.default_rng(0)
     half, axis = most / 2 * rng.random(20_000), rng.standard_normal((20_000, 3)) * [0.1, 1, 0.1]

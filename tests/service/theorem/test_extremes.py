@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import pi, sqrt
+from math import pi
 from typing import Any
 
 import numpy as np
@@ -61,14 +61,21 @@ def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step
         assert np.all(reached >= 0.999 * allowed)
 
 
-@pytest.mark.parametrize("amplitude", [(60, 50, 80), (1, 2, 3), (80, 100, 300), (0, 89, 10)])
-def test_the_extremes_are_those_of_every_combination_of_phases(amplitude: tuple[float, float, float]) -> None:
-    reference = Sinusoid(amplitude=amplitude, frequency=(1.0, sqrt(2), sqrt(3)))
-    phases = np.random.default_rng(1).uniform(0, 2 * pi, (300_000, 3))
-    phases[::2] = np.round(phases[::2] / (pi / 2)) * pi / 2 + 0.1 * (phases[::2] - pi)  # many extremes are near these
-    reached, allowed = largest(reference, Plan.of(reference).swing(phases)), bounds(reference)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_the_largest(seed: int) -> None:
+    """Frequencies that share no period, so that every combination of phases comes, some day."""
+    rng = np.random.default_rng(seed)
+    amplitude = tuple(rng.uniform((0, 0, 0), (80, 89, 300)).tolist())
+    reference = Sinusoid(amplitude=amplitude, frequency=tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist()))
+    allowed, reached = bounds(reference), np.zeros(9)
+    for _ in range(10):
+        phases = rng.uniform(0, 2 * pi, (100_000, 3))
+        phases[::2] = np.round(phases[::2] / (pi / 2)) * pi / 2 + 0.1 * (
+            phases[::2] - pi
+        )  # many extremes are near these
+        reached = np.maximum(reached, largest(reference, Plan.of(reference).swing(phases)))
     assert np.all(reached <= allowed)
-    assert np.all(reached >= 0.98 * allowed)
+    assert np.all(reached >= 0.85 * allowed)  # a random search misses what is narrow
 
 
 def test_axes_of_one_frequency_or_of_twice_another_keep_their_phases() -> None:

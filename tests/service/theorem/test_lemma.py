@@ -59,7 +59,7 @@ def paper_of(settings: Settings, **options: float) -> Paper:
 
 
 def wire_of(bits: int) -> WireSpec:
-    return WireSpec(actuators=3).with_bits(bits, bits)
+    return WireSpec(actuators=3).with_bits(f"{bits}/{bits}")
 
 
 def product(p: Floats, q: Floats) -> Floats:

@@ -35,10 +35,10 @@ FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)
 
 WIRES: Final = {
     "8/6": WireSpec(),
-    "10/10, eight bytes": WireSpec(counter_bits=4).with_bits(10, 10),
-    "16/16, FD": WireSpec().with_bits(16, 16),
+    "10/10, eight bytes": WireSpec(counter_bits=4).with_bits("10/10"),
+    "16/16, FD": WireSpec().with_bits("16/16"),
     "three actuators": WireSpec(actuators=3),
-    "cont/cont": WireSpec(counter_bits=10).with_bits(None, None),
+    "cont/cont": WireSpec(counter_bits=10).with_bits("cont/cont"),
     "dead zones": WireSpec(
         attitude=SignalSpec(bits=10, limit=1.0, deadzone=0.01),
         rate=SignalSpec(bits=12, limit=1e-9),

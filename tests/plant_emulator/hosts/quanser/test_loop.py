@@ -43,7 +43,7 @@ class Loop:
 @pytest.mark.parametrize(("bits", "wind"), [(("8", "6"), True), (("cont", "cont"), False)])
 def test_the_loop_on_the_board_is_the_loop_on_the_emulator_to_the_last_bit(bits: tuple[str, str], wind: bool) -> None:
     aero = AERO.model_copy(update={"wind": WindSettings(blowing=wind)})
-    settings = with_bits(Settings(plant=aero), *bits)
+    settings = with_bits(Settings(plant=aero), "/".join(bits))
     plant, board = plant_on_board(aero)
     on_board, emulated = Loop(plant, settings), Loop(emulated_aero(aero), settings)
     for _ in range(1000):

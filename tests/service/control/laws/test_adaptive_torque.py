@@ -148,7 +148,7 @@ MODELLED = """
 
 def test_it_learns_friction_and_wind_of_a_body_that_it_models() -> None:
     settings = load(overrides=[*BODY, *MODELLED.split()])
-    settings = settings.model_copy(update={"wire": settings.wire.with_bits(None, None)})
+    settings = settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
     controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
     run_experiment(settings, 100.0, controller=controller)
     learned, friction = controller.law_state, settings.plant.friction

@@ -265,7 +265,7 @@ def test_without_quantization_the_ideal_plant_follows_the_reference(kind: str, p
 
 def ideal(kind: str, overrides: tuple[str, ...]) -> Settings:
     settings = load(overrides=[f"law.kind={kind}", "plant.ideal=true", *overrides])
-    return settings.model_copy(update={"wire": settings.wire.with_bits(None, None)})
+    return settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
 
 
 def test_the_regulators_gains_are_optimal() -> None:

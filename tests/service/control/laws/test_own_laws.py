@@ -26,7 +26,7 @@ from tests.support.failing_laws import FAILING, Failure
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON
 
 PERIOD = 0.002
-CONTINUOUS = WireSpec(actuators=3).with_bits(None, None)
+CONTINUOUS = WireSpec(actuators=3).with_bits("cont/cont")
 
 
 def configured(kind: str, *overrides: str) -> Settings:
