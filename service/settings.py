@@ -14,11 +14,6 @@ class ControllerSettings(BaseModel, extra="forbid"):
     stale_s: float = Field(
         default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
     )
-    pace: Literal["measurement", "clock"] = Field(
-        default="measurement",
-        description="tick when a measurement arrives, so that the plant's clock leads, or on a grid of its own, "
-        "which takes the newest measurement; lockstep always ticks by measurements",
-    )
     duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
     auto_arm: bool = Field(
         default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"

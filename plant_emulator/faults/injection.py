@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FaultError, FrameFault, ValueFault
+from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FaultError, ValueFault
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import FaultStatus
 
@@ -153,7 +153,7 @@ class FaultyPlant(Plant):
         # The signal's name is part of the seed, so that the two streams do not lose the same ticks.
         random = np.random.default_rng([self._seed, number, *fault.signal.encode()])
         if of_frames:
-            return FrameFault(fault, random, self.time, self._last_frame.get(whole))
+            return ActingFault(fault, random, self.time, self._last_frame.get(whole))
         if whole == "motors":
             return ValueFault(fault, random, self.time, self._applied, self._limit)
         last = seen and (seen.attitude if whole == "attitude" else seen.rate)

@@ -12,7 +12,6 @@ times. README.md has the limits of the values, with their reasons. `injection` p
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -134,8 +133,10 @@ def _listed(words: Iterable[str]) -> str:
 Values: TypeAlias = tuple[float, ...]
 
 
-class ActingFault(ABC):
-    """A fault in the plant's time. `now` is the time of its injection [s], `last` what its signal was just before.
+class ActingFault:
+    """A fault of frames in the plant's time; its subclass is one of values.
+
+    `now` is the time of its injection [s], `last` what its signal was just before: the frame that passed last.
 
     Attributes:
         start: Start [s].
@@ -154,9 +155,10 @@ class ActingFault(ABC):
         self.held: deque[tuple[float, bytes]] = deque()
         self.changed = 0
 
-    @abstractmethod
     def apply(self, given: Any, t: float) -> Any:
-        """Values after the fault at time t [s]; or the frames that pass, of those given and those held back."""
+        """The frames that pass at time t [s], in order, of those given and those held back."""
+        assert self.kind.of_frames is not None
+        return self.kind.of_frames(self, given, t)
 
     def active(self, t: float) -> bool:
         """Whether it is at work at time t [s]: start ≤ t < end."""
@@ -167,15 +169,6 @@ class ActingFault(ABC):
         acts = self.active(t) and (self.kind.takes != "probability" or bool(self.random.random() < self.value))
         self.changed += acts
         return acts
-
-
-class FrameFault(ActingFault):
-    """A fault of frames; `last` is the frame that passed last."""
-
-    def apply(self, given: list[bytes], t: float) -> list[bytes]:
-        """The frames that pass at time t [s], in order."""
-        assert self.kind.of_frames is not None
-        return self.kind.of_frames(self, given, t)
 
 
 class ValueFault(ActingFault):
@@ -267,11 +260,11 @@ def _rotated(q: Values, error: Sequence[float]) -> Values:
     )
 
 
-def _drop_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _drop_frames(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     return [frame for frame in frames if not fault.acts(t)]
 
 
-def _repeat_last_frame(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _repeat_last_frame(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     passed = []
     for frame in frames:
         if not fault.acts(t) or fault.last is None:
@@ -280,7 +273,7 @@ def _repeat_last_frame(fault: FrameFault, frames: list[bytes], t: float) -> list
     return passed
 
 
-def _delay_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _delay_frames(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     """When the fault ends, all held frames pass at once, ahead of the newer ones."""
     active = fault.active(t)
     fault.changed += active * len(frames)
@@ -291,7 +284,7 @@ def _delay_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[byte
     return passed
 
 
-def _garble_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _garble_frames(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     passed = []
     for frame in frames:
         garbled = bytearray(frame)
@@ -302,13 +295,13 @@ def _garble_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[byt
     return passed
 
 
-def _duplicate_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _duplicate_frames(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     again = [frame for _, frame in fault.held]
     fault.held = deque((t, frame) for frame in frames if fault.acts(t))
     return again + frames
 
 
-def _reorder_frames(fault: FrameFault, frames: list[bytes], t: float) -> list[bytes]:
+def _reorder_frames(fault: ActingFault, frames: list[bytes], t: float) -> list[bytes]:
     passed = []
     for frame in frames:
         if fault.held:
@@ -329,7 +322,7 @@ class Kind(NamedTuple):
     takes: Literal["nothing", "bias", "deviation", "delay", "probability"]
     changes: str
     of_values: Callable[[ValueFault, Values], Values] | None
-    of_frames: Callable[[FrameFault, list[bytes], float], list[bytes]] | None
+    of_frames: Callable[[ActingFault, list[bytes], float], list[bytes]] | None
 
 
 KINDS: Final = {

@@ -120,8 +120,7 @@ class Bridge:
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
         self._network = ZenohNetwork(role, loop, self._relay, settings.state_directory, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
-        self._beat_due = 0.0
-        self._sent_state = self._relay.state  # by heartbeat
+        self._number = self._relay.number  # of the last session that the node was sent
         self._arrival: Arrival | None = None  # the last command since the last tick
         self._granted_ns = 0
 
@@ -150,7 +149,7 @@ class Bridge:
         finally:
             if relay.session is not None:
                 relay.release(relay.session)
-            self._beat()
+            self._follow_state()
             bus.close()
             network.leave()
 
@@ -208,21 +207,14 @@ class Bridge:
         return None
 
     def _follow_state(self) -> None:
-        """Send a heartbeat when it is due, and at once when the state has changed: the node follows it."""
+        """Send a heartbeat when it is due, and at once when a session begins or ends: the node follows it."""
         relay = self._relay
-        if relay.state is not self._sent_state:
-            self._sent_state = relay.state
-            self._beat_due = 0.0
-            if relay.state is PlantState.GRANTED:
-                self._bus.take()  # drop a frame from before the session
-                self._arrival = None
-                # The node sends its state ten times a second and at every change. Until it has received the first
-                # heartbeat of this session, it may still send its state of before.
-                self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
-        if time.monotonic() >= self._beat_due:
-            self._beat()
-
-    def _beat(self) -> None:
-        state = PlantState.GRANTED if self._relay.session is not None else PlantState.IDLE
-        self._beat_due = time.monotonic() + HEARTBEAT_S
-        self._bus.beat(Heartbeat(state, self._relay.number, self._fingerprint))
+        if relay.number != self._number:
+            self._number = relay.number
+            self._bus.take()  # drop a frame from before the session
+            self._arrival = None
+            # The node sends its state ten times a second and at every change. Until it has received the first
+            # heartbeat of this session, it may still send its state of before.
+            self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
+        state = PlantState.GRANTED if relay.session is not None else PlantState.IDLE
+        self._bus.beat_when_due(Heartbeat(state, relay.number, self._fingerprint))

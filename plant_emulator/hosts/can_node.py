@@ -7,7 +7,6 @@ commands, and trips on its own watchdog and limits. The node's own heartbeat car
 
 from __future__ import annotations
 
-import time
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
@@ -16,7 +15,7 @@ from aeroloop.protocol.messages.models import Claim, Event, EventKind
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.runtime.node import log_event
 from aeroloop.protocol.runtime.timing import Throttle
-from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.spec import LoopSettings
@@ -40,8 +39,6 @@ class CanNetwork(PlantNetwork):
         self._fingerprint = fingerprint(endpoint.wire, loop.period_ns, lockstep=loop.lockstep)
         self._number: int | None = None  # of the session
         self._throttle = Throttle()
-        self._beat_due = 0.0
-        self._sent_state = endpoint.state  # by heartbeat
 
     @property
     def link(self) -> Link | None:
@@ -52,7 +49,7 @@ class CanNetwork(PlantNetwork):
         """Send the first heartbeat."""
         bus = self._settings
         self._log("started", f"node {bus.node} waits on {bus.interface}:{bus.channel}")
-        self.publish_status()
+        self.follow_session()
 
     def take_inbox(self) -> None:
         """Follow the controller side's heartbeat: begin, end or lose a session."""
@@ -83,22 +80,14 @@ class CanNetwork(PlantNetwork):
         self.follow_session()
 
     def follow_session(self) -> None:
-        """Log events, and send a heartbeat ten times a second, and at once if the state has changed."""
+        """Log events, and send a heartbeat that is due."""
         endpoint = self._endpoint
         for notice in endpoint.notices:
             self._log(*notice)
         endpoint.notices.clear()
         endpoint.changes.clear()  # they belong to the trace
-        if endpoint.state is not self._sent_state or time.monotonic() >= self._beat_due:
-            self.publish_status()
-
-    def publish_status(self) -> None:
-        """Send a heartbeat."""
-        endpoint = self._endpoint
-        self._sent_state = endpoint.state
-        self._beat_due = time.monotonic() + HEARTBEAT_S
         cause = endpoint.trip.number if endpoint.trip else 0
-        self._bus.beat(Heartbeat(endpoint.state, cause, self._fingerprint))
+        self._bus.beat_when_due(Heartbeat(endpoint.state, cause, self._fingerprint))
 
     def leave(self) -> None:
         """Release a session, send an idle heartbeat, and close the bus."""

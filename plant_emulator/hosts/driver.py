@@ -74,10 +74,6 @@ class PlantNetwork(ABC):
         """Publish events and a status that is due, and close the link of a session that ended."""
 
     @abstractmethod
-    def publish_status(self) -> None:
-        """Publish the status."""
-
-    @abstractmethod
     def leave(self) -> None:
         """Publish that the plant stopped at 0 V, and leave the network."""
 

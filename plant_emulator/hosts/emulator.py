@@ -118,6 +118,8 @@ class EmulatorOnZenoh(Emulator):
         super().__init__(loop, wire, settings, role.stop)
         self._role = role
         self._steps: int | None = 0 if settings.steps_on_request else None  # steps left; None: no limit
+        directory = settings.state_directory
+        self._zenoh = ZenohNetwork(role, loop, self.endpoint, directory, faults=self.fault_statuses)
         rate_hz = settings.truth_rate_hz
         self._truth_every = max(1, round(loop.rate_hz / rate_hz)) if rate_hz else 0
 
@@ -125,10 +127,7 @@ class EmulatorOnZenoh(Emulator):
         """Run until the role stops; then set 0 V and publish a last status."""
         self._role.serve("inject", Inject, self._inject)
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        if network is None:
-            directory = self._settings.state_directory
-            network = ZenohNetwork(self._role, self._loop, self.endpoint, directory, faults=self.fault_statuses)
-        super().run(network)
+        super().run(network or self._zenoh)
 
     def _may_step(self) -> bool:
         return self._steps != 0
@@ -144,7 +143,7 @@ class EmulatorOnZenoh(Emulator):
     def _await_answer(self, echo: int) -> Arrival | None:
         arrival = super()._await_answer(echo)
         if self._steps == 0:
-            self._network.publish_status()  # ends the wait of the `advance` query's sender
+            self._zenoh.publish_status()  # ends the wait of the `advance` query's sender
         return arrival
 
     # ── queries `inject` and `advance`, for tests ──

@@ -20,8 +20,6 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.wire.frames import MIN_COUNTER_BITS, FrameFormat
-from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
 
 MEASUREMENT_ID: Final = 0x100
@@ -71,21 +69,16 @@ def carried_bytes(size: int) -> int:
 
 
 def check_widths(settings: CanSettings, wire: WireSpec) -> None:
-    """Raise CanError if a frame does not fit the bus, with what would fit."""
+    """Raise CanError if a frame does not fit the bus, with what to do."""
     bus, longest = ("CAN FD", FD_LENGTHS[-1]) if settings.fd else ("classic CAN", CLASSIC_BYTES)
+    or_fd = "" if settings.fd else ", or set can.fd = true"
     for name, frame, signals in (
         ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
         ("command", wire.command, "wire.voltage.bits"),
     ):
-        if frame.size <= longest:
-            continue
-        sizes = {n: FrameFormat([n] * len(frame.widths), wire.counter_bits).size for n in range(MIN_BITS, MAX_BITS + 1)}
-        ways = ["set can.fd = true"] if not settings.fd and frame.size <= FD_LENGTHS[-1] else []
-        ways.append(f"{signals} to {max(bits for bits, size in sizes.items() if size <= longest)} at the most")
-        if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
-            ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
-        problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
-        raise CanError(f"{problem}: {', or '.join(ways)}")
+        if frame.size > longest:
+            problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
+            raise CanError(f"{problem}: lower {signals}{or_fd}")
 
 
 def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:

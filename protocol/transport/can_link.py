@@ -16,6 +16,7 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
+    HEARTBEAT_S,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanError,
@@ -73,7 +74,8 @@ class CanLink(Link):
         self._settings = settings
         self._size = getattr(wire, received).size
         self._may_be_silent = len(UNCHANGED) in wire.lengths(received, lockstep=lockstep)
-        self._reopen_due = 0.0
+        self._reopen_due = self._beat_due = 0.0
+        self._sent: Heartbeat | None = None  # the last heartbeat sent
         self._open = False
         self.peer: Heartbeat | None = None
         self.peer_ns = 0  # last reception from the other end
@@ -87,7 +89,14 @@ class CanLink(Link):
 
     def beat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat."""
+        self._sent = heartbeat
+        self._beat_due = time.monotonic() + HEARTBEAT_S
         self._put(self._beat_id, heartbeat.pack())
+
+    def beat_when_due(self, heartbeat: Heartbeat) -> None:
+        """Send a heartbeat ten times a second, and at once if it says something new."""
+        if heartbeat != self._sent or time.monotonic() >= self._beat_due:
+            self.beat(heartbeat)
 
     def silent_s(self) -> float:
         """Time since the last reception from the other end [s]; infinite if there was none."""

@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from importlib.metadata import version
 from math import inf
 from typing import Any, Final
 
@@ -33,7 +32,7 @@ from aeroloop.protocol.transport.network_settings import (
     protected,
 )
 from aeroloop.protocol.transport.probe import accepting, refusal
-from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, THREADS, router_config, zenoh_config
+from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, router_config, zenoh_config
 
 log: Final = logging.getLogger("aeroloop")
 COMMAND_S: Final = 0.5
@@ -88,15 +87,6 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
             f"cannot listen on {', '.join(config['listen']['endpoints']) or 'nothing'}: {_reason(error)}; "
             "name a free endpoint of this host in network.rendezvous or network.listen"
         ) from None
-
-
-def zenohd_config(settings: NetworkSettings, identity: Identity) -> str:
-    """A router's configuration as JSON5, for a stock `zenohd` of the same version. Raises as `join`."""
-    return (
-        f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"
-        f"// ZENOH_RUNTIME='{THREADS}' zenohd --config FILE\n"
-        f"{json.dumps(router_config(protected(settings, identity)), indent=2)}\n"
-    )
 
 
 class CommandSession:

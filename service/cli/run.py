@@ -165,25 +165,10 @@ def _fault_options(faults: list[str] | None) -> list[str]:
 
 
 @group.command()
-def router(
-    print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the configuration for a stock zenohd, JSON5, and end.")
-    ] = False,
-    log_format: LogFormat = "text",
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
+def router(log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None) -> None:
     """Run a router for clients until SIGTERM, which have network.mode = "client"."""
     log_as("router", log_format)
     settings = settings_of(config, overrides)
-    if print_config:
-        from aeroloop.protocol.transport.network import zenohd_config
-        from aeroloop.protocol.transport.network_settings import Identity
-
-        with guarded():
-            typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)
-        return
-
     from aeroloop.service.daemon.roles import run_router
 
     run_role("router", settings, run_router)

@@ -113,14 +113,7 @@ class Session:
         self._law_timeout_s = own.law_timeout_s
         self._last_tick = loop.ticks(own.duration_s) - 1 if own.duration_s else None
         self._telemetry_every = max(1, round(loop.rate_hz / own.telemetry_rate_hz))
-        self._source = TickSource(
-            link,
-            loop,
-            settings.wire,
-            own_grid=own.pace == "clock" and not loop.lockstep,
-            stale_s=own.stale_s,
-            clock=role.clock,
-        )
+        self._source = TickSource(link, loop, settings.wire, stale_s=own.stale_s, clock=role.clock)
         self._k = -1
         shared.machine.fire(Trigger.GRANT)
         shared.plant.follow(self.name)
@@ -212,7 +205,7 @@ class Session:
         self._k = now.tick
         sent_ns = clock.monotonic_ns()
         if timing:
-            timing.woke(now.due_ns, woke_ns)
+            timing.woke(now.at_ns, woke_ns)
         shared.age.add(sent_ns - now.at_ns)
         self._record(now, command, sent_ns)
         self._count(now, command)

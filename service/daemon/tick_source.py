@@ -3,8 +3,7 @@
 Where the plant sends every tick, a tick is due when its measurement arrives, so that the plant's clock leads. Where it
 sends on change, a tick without a frame is silent once half a period has passed since the frame was due on the plant's
 grid, as the earliest frames mark that grid on this end's monotonic clock. A frame that arrives later than that is late:
-its tick was computed with the previous levels. One that arrives later than `stale_s` is stale and not answered. With a
-grid of its own the controller takes the newest frame whenever a tick of that grid is due.
+its tick was computed with the previous levels. One that arrives later than `stale_s` is stale and not answered.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import time
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.messages.trace import Received
-from aeroloop.protocol.runtime.timing import Clock, TickGrid
+from aeroloop.protocol.runtime.timing import Clock
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -25,9 +24,6 @@ MAILBOX: Final = 16
 PATIENCE: Final = 0.5
 """Share of a period by which a frame may be later than the fastest before its tick is silent."""
 
-OWN_PATIENCE: Final = 0.1
-"""The same on a grid of its own: a silent tick that is taken a tick later is displaced by a frame."""
-
 
 class PlantTick(NamedTuple):
     """One tick of the plant, or a frame that arrived when its tick was over.
@@ -36,8 +32,7 @@ class PlantTick(NamedTuple):
         tick: The session tick.
         frame: The measurement; UNCHANGED if its levels have not changed.
         received_as: Classification. A late frame is no tick; only its levels are used.
-        due_ns: From when it could be answered, on `time.monotonic_ns()`.
-        at_ns: When the frame arrived, or the tick was found silent, on the same clock.
+        at_ns: When the frame arrived, or the tick became silent, on `time.monotonic_ns()`: it can be answered now.
         late_ns: How much later than the fastest the frame arrived [ns]; 0 for silence.
         missed: Ticks between the last one and this that were not received in time.
         fresh: Whether it shows that the plant is alive: a frame that is not stale or, in lockstep, an empty one.
@@ -46,7 +41,6 @@ class PlantTick(NamedTuple):
     tick: int
     frame: bytes
     received_as: Received
-    due_ns: int
     at_ns: int
     late_ns: int = 0
     missed: int = 0
@@ -62,19 +56,15 @@ class TickSource:
     that of the link's arrivals.
     """
 
-    def __init__(
-        self, link: Link, loop: LoopSettings, wire: WireSpec, *, own_grid: bool, stale_s: float, clock: Clock = time
-    ) -> None:
+    def __init__(self, link: Link, loop: LoopSettings, wire: WireSpec, *, stale_s: float, clock: Clock = time) -> None:
         self._link = link
         self._clock = clock
         self._counter = wire.measurement.counter
-        self._grid = TickGrid(loop.period_ns, clock=clock) if own_grid else None
         self._ticks = TickCounter(loop.period_ns, wire.measurement.counters, lockstep=loop.lockstep)
         self._lockstep = loop.lockstep
         self._sparse = wire.transmit.measurement == "on_change" and not loop.lockstep
-        self._patience_ns = round((OWN_PATIENCE if own_grid else PATIENCE) * loop.period_ns)
+        self._patience_ns = round(PATIENCE * loop.period_ns)
         self._stale_ns = round(stale_s * 1e9)
-        self._no_tick = False  # whether the last frame taken was no tick
         self._last_read = -1  # tick of the last frame that could be read
         self.tick = -1
 
@@ -108,11 +98,6 @@ class TickSource:
         return self._as_tick(tick, arrival, Received.SILENT if empty else Received.MALFORMED, 0, fresh=empty)
 
     def _receive(self, timeout_s: float) -> Arrival | None:
-        if self._grid is not None:
-            if not self._no_tick:
-                self._grid.wait()
-            self._no_tick = False
-            return self._link.take()
         if self._sparse and self._ticks.known:
             timeout_s = min(timeout_s, 1e-9 * max(0, self._over_ns(self.tick + 1) - self._clock.monotonic_ns()))
         return self._link.wait(timeout_s)
@@ -128,8 +113,7 @@ class TickSource:
     def _not_a_tick(
         self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool
     ) -> PlantTick:
-        self._no_tick = True
-        return PlantTick(tick, arrival.frame, received_as, arrival.at_ns, arrival.at_ns, late_ns, fresh=fresh)
+        return PlantTick(tick, arrival.frame, received_as, arrival.at_ns, late_ns, fresh=fresh)
 
     def _silence(self) -> PlantTick | None:
         """The last tick that is silent now; those before it, back to the last one taken, are missed."""
@@ -140,10 +124,8 @@ class TickSource:
         if tick <= self.tick:
             return None
         missed, self.tick = tick - self.tick - 1, tick
-        due_ns = self._over_ns(tick)
-        return PlantTick(tick, UNCHANGED, Received.SILENT, due_ns, due_ns, missed=missed)
+        return PlantTick(tick, UNCHANGED, Received.SILENT, self._over_ns(tick), missed=missed)
 
     def _as_tick(self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool) -> PlantTick:
         missed, self.tick = max(0, tick - self.tick - 1), tick
-        due_ns = self._grid.due_ns if self._grid else arrival.at_ns
-        return PlantTick(tick, arrival.frame, received_as, due_ns, arrival.at_ns, late_ns, missed, fresh)
+        return PlantTick(tick, arrival.frame, received_as, arrival.at_ns, late_ns, missed, fresh)

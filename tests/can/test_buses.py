@@ -80,8 +80,8 @@ def test_a_spec_that_does_not_fit_the_bus_is_refused_at_start_in_one_line(comman
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert line == (
-        "aeroloop: a measurement frame has 9 bytes, and a classic CAN frame holds 8: set can.fd = true, or "
-        "wire.attitude.bits and wire.rate.bits to 9 at the most"
+        "aeroloop: a measurement frame has 9 bytes, and a classic CAN frame holds 8: lower wire.attitude.bits "
+        "and wire.rate.bits, or set can.fd = true"
     )
 
 

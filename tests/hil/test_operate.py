@@ -117,12 +117,3 @@ def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(h
     assert since is not None
     assert f"plant: {stopped} ({since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" in done(hil, "status")
     assert hil.log.trips == [stopped]
-
-
-def test_a_controller_on_a_grid_of_its_own_drives_the_plant_too(hil: Hil) -> None:
-    hil.start(settings={**PATIENT, "controller.pace": "clock"})
-    hil.run(2.0)
-    figures = hil.log.figures
-    # Two grids side by side: a measurement waits for up to a period, and one is missed where they drift apart.
-    assert figures.command.frames_per_s > 250
-    assert figures.max_error_deg < 10

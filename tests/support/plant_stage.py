@@ -172,9 +172,6 @@ class Stage(PlantNetwork):
         if self.endpoint.session is None:
             self.wires.close()
 
-    def publish_status(self) -> None:
-        """Nothing to publish."""
-
     def leave(self) -> None:
         self.follow_session()
         self.trace.finish()

@@ -187,8 +187,7 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
         assert isinstance(endpoint.claim(claim), Grant)
         world.trace.follow(endpoint)
         end = ControllerEnd(settings, known.messages, clock)
-        own_grid, stale_s = chance.random() < 0.3, settings.controller.stale_s
-        source = TickSource(world, loop, wire, own_grid=own_grid, stale_s=stale_s, clock=world)
+        source = TickSource(world, loop, wire, stale_s=settings.controller.stale_s, clock=world)
         k = -1
         while world.now_ns < ticks * loop.period_ns and endpoint.session is not None:
             now = source.next(0.02)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from hashlib import sha256
 
 from hypothesis import given, settings
@@ -51,12 +50,6 @@ def test_causes_are_numbered_as_in_the_specification() -> None:
 
 
 WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))
-ADVICE = re.compile(
-    r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a (?P<bus>classic CAN|CAN FD) frame holds \d+: "
-    r"(?P<fd>set can\.fd = true, or )?"
-    r"wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
-    r"(?P<shorter>, or wire\.counter_bits = 4 with can\.short_counter = true)?$"
-)
 
 
 def _refusal(spec: WireSpec, *, fd: bool) -> str | None:
@@ -72,30 +65,22 @@ def _refusal(spec: WireSpec, *, fd: bool) -> str | None:
     bits=st.fixed_dictionaries({"attitude": WIDTHS, "rate": WIDTHS, "voltage": WIDTHS}),
     actuators=st.integers(1, MAX_ACTUATORS),
     counted=st.sampled_from([4, 8, 16]),
+    fd=st.booleans(),
 )
-def test_a_spec_that_does_not_fit_is_refused_with_the_widths_that_would(
-    bits: dict[str, int | None], actuators: int, counted: int
+def test_a_spec_is_refused_if_and_only_if_a_frame_does_not_fit_and_the_line_names_its_signals(
+    bits: dict[str, int | None], actuators: int, counted: int, fd: bool
 ) -> None:
-    def spec(bits: dict[str, int | None], counter_bits: int = counted) -> WireSpec:
-        return wire_of(**bits, actuators=actuators, counter_bits=counter_bits)
-
-    on_fd = _refusal(spec(bits), fd=True)
-    assert (on_fd is not None) == (spec(bits).command.size > 64)  # eight doubles
-    assert on_fd is None or "can.fd" not in on_fd
-    while (said := _refusal(spec(bits), fd=False)) is not None:
-        advice = ADVICE.match(said)
-        assert advice is not None, said
-        frame, size, widest = advice["frame"], int(advice["size"]), int(advice["widest"])
-        assert getattr(spec(bits), frame).size == size > 8
-        assert (advice["fd"] is not None) == (size <= 64)
-        assert (advice["shorter"] is not None) == (getattr(spec(bits, 4), frame).size <= 8)
-        signals = [name for name in (advice["first"], advice["second"]) if name is not None]
-        bits = bits | dict.fromkeys(signals, widest)
-        assert getattr(spec(bits), frame).size <= 8
-        if widest < MAX_BITS:
-            assert getattr(spec(bits | dict.fromkeys(signals, widest + 1)), frame).size > 8
-    assert spec(bits).measurement.size <= 8
-    assert spec(bits).command.size <= 8
+    wire = wire_of(**bits, actuators=actuators, counter_bits=counted)
+    longest = 64 if fd else 8
+    said = _refusal(wire, fd=fd)
+    assert (said is not None) == (max(wire.measurement.size, wire.command.size) > longest)
+    if said is not None:
+        measured = wire.measurement.size > longest
+        frame, signal = ("measurement", "attitude") if measured else ("command", "voltage")
+        size = getattr(wire, frame).size
+        assert said.startswith(f"a {frame} frame has {size} bytes")
+        assert f"lower wire.{signal}.bits" in said
+        assert ("can.fd" in said) == (not fd)
 
 
 def test_the_fingerprint_is_the_one_of_the_specification() -> None:

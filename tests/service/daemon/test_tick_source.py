@@ -48,13 +48,10 @@ class Source:
         depth: int = MAILBOX,
         wire: WireSpec = WIRE,
         loop: LoopSettings = LOOP,
-        grid_ns: int | None = None,  # begin of a grid of its own
         stale_s: float = 0.1,
     ) -> None:
         self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), depth)
-        self.link.pass_time(grid_ns or 0)
-        own_grid = grid_ns is not None
-        self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s, clock=self.link)
+        self.source = TickSource(self.link, loop, wire, stale_s=stale_s, clock=self.link)
         self.taken: list[tuple[PlantTick, int]] = []  # and when
 
     def run(self, until_ns: int) -> list[PlantTick]:
@@ -102,7 +99,7 @@ def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later() -> No
     }  # fmt: skip
     assert all(each.missed == 0 for each in ticks)
     assert all((each.received_as is Received.SILENT) == (each.frame == UNCHANGED) == (not each.fresh) for each in ticks)
-    assert all(each.due_ns == source.when(each.tick) for each in ticks)
+    assert all(each.at_ns == source.when(each.tick) for each in ticks)
 
 
 def test_a_late_frame_is_no_second_tick_and_brings_its_levels() -> None:
@@ -187,22 +184,6 @@ def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost() -> None:
     source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
     source.run(PERIOD_NS * 30)
     assert source.ticks == [*range(29), 30]
-
-
-# On a grid of one's own
-
-
-@pytest.mark.parametrize("phase_ns", [250_000, 700_000, 1_300_000, 1_900_000])
-@pytest.mark.parametrize("every", [1, 2, 5])
-def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(phase_ns: int, every: int) -> None:
-    """Wherever in the plant's period it stands, but for its first tenth, and however often there is a frame."""
-    last = 300
-    frames = heartbeats(last, {k: k % 5 for k in range(0, last, every)})
-    source = Source(frames, grid_ns=phase_ns + DELAY_NS)
-    ticks = source.run(last * PERIOD_NS)
-    assert len(source.ticks) > last - 5
-    assert sorted(set(source.ticks)) == source.ticks
-    assert sum(each.missed for each in ticks) <= 1
 
 
 # Where every tick has a frame
