@@ -35,7 +35,6 @@ from aeroloop.service.lab.sweep import PROCESSES, Progress, Row, Sheets, open_wo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
 
 # ── the grid ──
 
@@ -335,10 +334,6 @@ def bits_of(point: Row) -> str:
 
 # ── as text ──
 
-_COLUMNS: Final = (
-    "z_track, 10⁻⁴ s", "u_total, V²·s", "changes/s", "every tick: kbit/s", "every tick: CAN kbit/s",
-    "on change: frames/s", "on change: ms between, mean", "least", "on change: kbit/s", "on change: CAN kbit/s",
-)  # fmt: skip
 _SPLIT: Final = "†"
 
 
@@ -349,7 +344,9 @@ def sheets(burden: Burden) -> Sheets:
     """
     for name, text in burden.sensors.items():
         points = burden.under(name)
-        yield f"sensors {name}: {text}", [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
+        rows = [_row(*both) for both in zip(points[::2], points[1::2], strict=True)]
+        titles = max(rows, key=len)  # float64 has figures
+        yield f"sensors {name}: {text}", [dict.fromkeys(titles, "–") | row for row in rows]
         reasons = [
             f"{bits_of(point)} {_short_name(point)}: {point['reason']}." for point in points[::2] if point["reason"]
         ]
@@ -365,24 +362,24 @@ def _short_name(point: Row) -> str:
 
 
 def _row(always: Row, changed: Row) -> dict[str, str]:
-    """A row of a point at every tick, and the same sent on change."""
+    """A row of a point at every tick, and the same sent on change; nothing but its name where it has no figures."""
     name = {"bits out/in": bits_of(always), "quantizer": _short_name(always)}
     if always["reason"] is not None:
-        return name | dict.fromkeys(_COLUMNS, "–")
+        return name
     error, out, inp = always["against_float64"]["z_track"], changed["measurement"], changed["command"]
-    cells = (
-        f"{always['z_track'] * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
-        f"{always['u_total']:.0f}",
-        f"{out['changes_per_s']:.0f} + {inp['changes_per_s']:.0f}",
-        _payload(always),
-        _bus(always),
-        f"{out['frames_per_s']:.0f} + {inp['frames_per_s']:.0f}",
-        f"{_ms(out['mean_interval_ms'])} + {_ms(inp['mean_interval_ms'])}",
-        f"{_ms(out['least_interval_ms'], 'g')} + {_ms(inp['least_interval_ms'], 'g')}",
-        _payload(changed),
-        _bus(changed),
-    )
-    return name | dict(zip(_COLUMNS, cells, strict=True))
+    return {
+        **name,
+        "z_track, 10⁻⁴ s": f"{always['z_track'] * 1e4:.1f} (×{error:.{2 if error < 9.995 else 1}f})",
+        "u_total, V²·s": f"{always['u_total']:.0f}",
+        "changes/s": f"{out['changes_per_s']:.0f} + {inp['changes_per_s']:.0f}",
+        "every tick: kbit/s": _payload(always),
+        "every tick: CAN kbit/s": _bus(always),
+        "on change: frames/s": f"{out['frames_per_s']:.0f} + {inp['frames_per_s']:.0f}",
+        "on change: ms between, mean": f"{_ms(out['mean_interval_ms'])} + {_ms(inp['mean_interval_ms'])}",
+        "least": f"{_ms(out['least_interval_ms'], 'g')} + {_ms(inp['least_interval_ms'], 'g')}",
+        "on change: kbit/s": _payload(changed),
+        "on change: CAN kbit/s": _bus(changed),
+    }
 
 
 def _payload(point: Row) -> str:
@@ -447,11 +444,6 @@ def draw_burden(burden: Burden, path: Path) -> None:
 
     from aeroloop.service.report.figure_style import WIDTH_IN, figure_style, save_as
 
-    def key(color: str, marker: str, label: str, face: str | None = None) -> Line2D:
-        face = face or color
-        style = {"marker": marker, "markerfacecolor": face, "linestyle": "none", "markersize": 4, "label": label}
-        return Line2D([], [], color=color, **style)  # type: ignore[arg-type]  # keywords of several types
-
     names, styles = list(burden.sensors), _styles()
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
@@ -473,17 +465,24 @@ def draw_burden(burden: Burden, path: Path) -> None:
             if i + columns >= len(names):  # the last of its column
                 panel.set_xlabel("payload of measurements and commands [kbit/s]")
                 panel.tick_params(labelbottom=True)
-        drawn = {_short_name(point): styles[point["quantizer"]] for point in burden.points if point["quantizer"]}
+        drawn = {_short_name(point): styles[point["quantizer"]] for point in burden.points}
         legend = [
-            *(key(*style, name) for name, style in drawn.items()),
-            key(*styles[None], "float64"),
-            key("0.4", "o", "sent on change"),
-            key("0.4", "o", "sent at every tick", face="white"),
+            *(
+                Line2D([], [], marker=marker, label=name, **marks(color, face=color))
+                for name, (color, marker) in drawn.items()
+            ),
+            Line2D([], [], marker="o", label="sent on change", **marks("0.4", face="0.4")),
+            Line2D([], [], marker="o", label="sent at every tick", **marks("0.4")),
             Line2D([], [], color="0.45", linewidth=0.9, label="Pareto front, bits out/in"),
             Line2D([], [], color="0.3", linewidth=0.6, linestyle=":", label="float64 at every tick"),
         ]
         figure.legend(handles=legend, loc="outside lower center", ncols=3)
         save_as(figure, path)
+
+
+def marks(color: str, face: str = "white") -> dict[str, Any]:
+    """Style of marks in a figure of a study, hollow unless they have a face."""
+    return {"color": color, "markerfacecolor": face, "linestyle": "none", "markersize": 4}
 
 
 def _styles() -> dict[str | None, tuple[str, str]]:
@@ -515,9 +514,7 @@ def _draw(panel: Axes, points: list[Row]) -> None:
     for point in points:
         (color, marker), (payload, error) = _styles()[point["quantizer"]], _place(point)
         face, order = color if point["transmit"] == "on_change" else "white", 4 if point["pareto"] else 3
-        panel.plot(
-            payload, error, marker, color=color, markersize=4, markerfacecolor=face, linestyle="none", zorder=order
-        )
+        panel.plot(payload, error, marker, zorder=order, **marks(color, face))
         if _is_baseline(point):
             panel.axvline(payload, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
             panel.axhline(error, color="0.3", linewidth=0.6, linestyle=":", zorder=1)

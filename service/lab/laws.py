@@ -1,9 +1,10 @@
-"""Comparison of laws: every law × bits × sensors × wind × plant in a sweep, then what each law survives.
+"""Comparison of laws: every law × bits × sensors × wind × plant in a sweep, what is proven of each, what each survives.
 
 A law that is not the configured one has the gains of the tuning rule, from the bandwidth and damping ratio of the
-configured C₁ and C₂; a law of one's own has its defaults. Everything else is the same for all of them. Frames are sent
-on change, so that a law that chatters pays in bits. Then delay and lost frames grow, calm and with the first of bits
-and sensors, until the attitude error leaves a bound or the plant trips.
+configured C₁ and C₂; a law of one's own has its defaults. A law that adapts stands beside itself with all adaptation
+gains 0. Everything else is the same for all of them. Frames are sent on change, so that a law that chatters pays in
+bits. Then delay and lost frames grow, calm and with the first of bits and sensors, until the attitude error leaves a
+bound or the plant trips.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
-from itertools import groupby, product
+from itertools import cycle, groupby, product
 from math import inf
 from operator import itemgetter
 from pathlib import Path
-from statistics import fmean
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from statistics import fmean, stdev
+from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -26,19 +27,14 @@ from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.baselines import (
-    TUNED,
-    NonadaptiveSettings,
-    Response,
-    TrackingSettings,
-    response_of,
-    tuned,
-)
+from aeroloop.service.control.laws.baselines import TUNED, NonadaptiveSettings, Response, response_of, tuned
+from aeroloop.service.control.laws.interface import EstimateSettings
 from aeroloop.service.lab.axes import Axis, Configuration, digest_of
-from aeroloop.service.lab.burden import SENSORS, bits_of_text, chosen
+from aeroloop.service.lab.burden import SENSORS, bits_of_text, chosen, marks
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.sweep import (
     PROCESSES,
+    Column,
     Progress,
     Row,
     Sheets,
@@ -48,14 +44,21 @@ from aeroloop.service.lab.sweep import (
     sweep_rows,
     write_table,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from aeroloop.service.theorem.any_law import certify_any
+from aeroloop.service.theorem.extremes import BoundlessError
+from aeroloop.service.theorem.feedback import NoTheoremError
 
 # ── what is compared ──
 
-LAWS: Final = ("adaptive", "nonadaptive", *TUNED)
+_OFF: Final = [0.0, 0.0, 0.0]
+WITHOUT_ADAPTATION: Final[dict[str, dict[str, Any]]] = {
+    "adaptive": {"kind": "nonadaptive"},  # the same law with θ̂ as first estimated; its own Γ cannot be 0
+    "adaptive-torque": {"Gamma_torque": _OFF, "Gamma_damping": _OFF, "Gamma_coulomb": _OFF},
+}
+"""Settings that take the adaptation from a law."""
+_NO_GAMMA: Final = ", Γ = 0"
+"""Ends the name of such a law."""
+LAWS: Final = ("adaptive", *TUNED)
 BITS: Final = ("8/6", "cont/cont")
 WINDS: Final = {"calm": False, "wind": True}
 PLANTS: Final = ("aero", "rigid_body")
@@ -97,7 +100,7 @@ def compare(
     duration_s: float,
     within_deg: float = WITHIN_DEG,
 ) -> Comparison:
-    """Every combination of what is given.
+    """Every combination of what is given, and each law that adapts also without its adaptation.
 
     Where nothing is: the configured law and LAWS, BITS, encoders, WINDS, and PLANTS or a configured other plant.
 
@@ -116,61 +119,54 @@ def compare(
         GridError: An unknown name.
         ConfigError, PluginError, LawError: A combination is no configuration, or has no such law.
     """
-    found = list[tuple[Choice, Configuration]]()
     bodies = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
     levels, airs = chosen("--sensors", sensors or ("encoders",), SENSORS), chosen("--wind", winds, WINDS)
-    pairs = dict.fromkeys(str(bits_of_text(text)) for text in bits or BITS)
-    for plant, sensor, wind, pair in product(dict.fromkeys(bodies), levels, airs, pairs):
-        for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
-            choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
-            if all(choice != other for other, _ in found):
-                description = with_law_settings(load_over(settings, overrides)).description()
-                found.append((choice, Configuration(overrides, choice, digest_of(description, duration_s))))
-    choices, configurations = map(list, zip(*found, strict=True))
-    names = [Axis(name, ()) for name in Choice._fields]
-    return Comparison(
-        SweepPlan(settings, names, configurations, seeds, duration_s), choices, _response(settings), within_deg
-    )
+    pairs = [str(bits_of_text(text)) for text in bits or BITS]
+    kinds = dict.fromkeys(laws or (settings.law.kind, *LAWS))
+    names = [name for kind in kinds for name in (kind, kind + _NO_GAMMA)[: 1 + (kind in WITHOUT_ADAPTATION)]]
+    found = dict[Choice, Configuration]()
+    for plant, sensor, pair, law, wind in product(bodies, levels, pairs, names, airs):
+        choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
+        if choice not in found:
+            description = with_law_settings(load_over(settings, overrides)).description()
+            found[choice] = Configuration(overrides, choice, digest_of(description, duration_s))
+    axes = [Axis(name, ()) for name in Choice._fields]
+    plan = SweepPlan(settings, axes, list(found.values()), seeds, duration_s)
+    return Comparison(plan, list(found), _response(settings), within_deg)
 
 
 def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]]:
     """A combination as it can be had, and its overrides: a body without joints has no encoders."""
-    bits = bits_of_text(choice.bits)
-    changes: dict[str, Any] = {
-        "wire": {
-            **{name: {"bits": each} for name, each in bits._asdict().items()},
-            "transmit": {"measurement": "on_change", "command": "on_change"},
-        },
-        "plant": {"kind": choice.plant},
+    plant: dict[str, Any] = {"kind": choice.plant}
+    wire: dict[str, Any] = {
+        **{name: {"bits": bits} for name, bits in bits_of_text(choice.bits)._asdict().items()},
+        "transmit": {"measurement": "on_change", "command": "on_change"},
     }
-    plant, body = changes["plant"], settings.law
+    body = settings.law
     if choice.plant not in PLANTS:
         choice = choice._replace(sensors=AS_CONFIGURED, wind=AS_CONFIGURED)
-        changes["wire"]["actuators"] = _motors(settings, choice.plant)
+        with closing(load_over(settings, [f"plant.kind={choice.plant}"]).plant.make(settings.loop.period)) as made:
+            wire["actuators"] = made.actuators
     elif settings.plant.ideal:
         choice = choice._replace(sensors=IDEAL, wind=IDEAL)
-        plant["sensors"], plant["wind"] = {}, {}
+        plant |= {"sensors": {}, "wind": {}}
     else:
-        plant["sensors"] = dict(SENSORS[choice.sensors].changes)
-        plant["wind"] = {"blowing": WINDS[choice.wind]}
+        plant |= {"sensors": dict(SENSORS[choice.sensors].changes), "wind": {"blowing": WINDS[choice.wind]}}
     if choice.plant == "rigid_body":
         rate = plant["sensors"].get("rate", "perfect")
         plant["sensors"] |= {"attitude": "perfect", "rate": "perfect" if rate == "derivative" else rate}
         choice = choice._replace(sensors={"encoders": "perfect"}.get(choice.sensors, choice.sensors))
         if settings.plant.kind != "rigid_body":
             body = body.model_copy(update={"allocation": three_motors(body.allocation)})
-            plant |= _free_body(settings, body.allocation)
+            same = {
+                name: getattr(body, name) for name in ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
+            }
+            plant["rigid_body"] = {**same, "damping": IDEAL_AERO.damping}
+            plant["rotor"] = {"lag_up_s": 0.0, "lag_down_s": 0.0}
+            plant["friction"] = {"viscous": [], "coulomb": []}
             plant["wind"]["torque"] = [0.0, *settings.plant.wind.torque[:2]]  # about y and z, as on the Aero
-            changes["wire"]["actuators"] = 3
-    law = _law(settings, choice.law, body)
-    return choice, tuple(as_overrides({**changes, "law": law}))
-
-
-def _motors(settings: Settings, kind: str) -> int:
-    """Motors of a plant of one's own. Raises PluginError or PlantError if it cannot be made."""
-    plant = load_over(settings, [f"plant.kind={kind}"]).plant.make(settings.loop.period)
-    plant.close()
-    return plant.actuators
+            wire["actuators"] = 3
+    return choice, tuple(as_overrides({"wire": wire, "plant": plant, "law": _law(settings, choice.law, body)}))
 
 
 def three_motors(allocation: Sequence[Sequence[float]]) -> list[list[float]]:
@@ -180,29 +176,18 @@ def three_motors(allocation: Sequence[Sequence[float]]) -> list[list[float]]:
     return [[strongest, 0.0, 0.0], *([0.0, *row] for row in motors)]
 
 
-def _free_body(settings: Settings, allocation: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """A plant of the paper's equations: the body of the law's model, with the damping of an ideal Aero."""
-    law = settings.law
-    same = {name: getattr(law, name) for name in ("inertia", "mass", "gravity", "centre_of_mass")}
-    return {
-        "rigid_body": {**same, "allocation": allocation, "damping": IDEAL_AERO.damping},
-        "rotor": {"lag_up_s": 0.0, "lag_down_s": 0.0},
-        "friction": {"viscous": [], "coulomb": []},
-    }
-
-
-def _law(settings: Settings, kind: str, body: Any) -> dict[str, Any]:
-    """`[law]` of a law of this kind, over the configuration's."""
-    allocation = {"allocation": [list(row) for row in body.allocation]}
-    if kind == settings.law.kind:
-        return allocation
-    papers = isinstance(settings.law, AdaptiveSettings | NonadaptiveSettings)
-    known = {}
-    if kind in LAWS and isinstance(settings.law, AdaptiveSettings | NonadaptiveSettings | TrackingSettings):
-        known["damping_estimate"] = settings.law.damping_estimate
-    if kind in ("adaptive", "nonadaptive") and papers:
-        known |= {name: getattr(settings.law, name) for name in ("C1", "C2")}
-    return {"kind": kind, **allocation, **known, **tuned(kind, body, _response(settings))}
+def _law(settings: Settings, name: str, body: Any) -> dict[str, Any]:
+    """`[law]` of a law of this name, over the configuration's."""
+    law, kind = settings.law, name.removesuffix(_NO_GAMMA)
+    section: dict[str, Any] = {"allocation": [list(row) for row in body.allocation]}
+    off = WITHOUT_ADAPTATION[kind] if kind != name else {}
+    if (kind := off.get("kind", kind)) == law.kind:
+        return section | off
+    if kind in (*LAWS, "nonadaptive") and isinstance(law, EstimateSettings):  # what is known of the body's damping
+        section |= {"damping_estimate": law.damping_estimate, "damping_bound": law.damping_bound}
+    if kind in ("adaptive", "nonadaptive") and isinstance(law, AdaptiveSettings | NonadaptiveSettings):
+        section |= {"C1": law.C1, "C2": law.C2}
+    return {"kind": kind, **section, **tuned(kind, body, _response(settings)), **off}
 
 
 def _response(settings: Settings) -> Response:
@@ -217,6 +202,7 @@ def _response(settings: Settings) -> Response:
 
 _MEANS: Final = ("z_track", "u_total", "command_changes_per_s")
 _WORST: Final = ("max_error_deg", "second_half_error_deg")
+_PROVEN: Final = ("pointwise_deg", "plant_deg", "holds")
 _MARGINS: Final = {
     "delay_ms": "largest further delay of commands within the bound [ms]; null: none is",
     "lost_frames": "most commands lost in a row, again and again; null: none may be",
@@ -226,9 +212,11 @@ _MARGINS: Final = {
 class Laws(BaseModel):
     """The comparison.
 
-    A row has its `Choice`, figures by the names of `Figures` (means over the seeds, and the largest errors of any),
-    bits_per_s of both directions, sent on change, and reason, why there are no figures: then all of them are None. A
-    margin has law, plant, delay_ms and lost_frames: what the law survives, calm, with the first of bits and sensors.
+    A row has its `Choice`; of the law's certificate `holds`, pointwise_deg and plant_deg by the names of `Certificate`,
+    all null of a law without a theorem; figures by the names of `Figures` (means over the seeds, and the largest errors
+    of any); spread, standard deviations of the means over the seeds, null for one seed; bits_per_s of both directions,
+    sent on change; and reason, why there are no figures: then all of them are None. A margin has law, plant, delay_ms
+    and lost_frames: what the law survives, calm, with the first of bits and sensors.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -280,11 +268,13 @@ def run_comparison(
         texts = {**_MARGINS, "within_deg": "bound of the attitude error, for the margins [deg]"}
         whole = [row | margin | {"within_deg": within_deg} for row, margin in zip(rows, further, strict=True)]
         write_table(out, plan, whole, texts)
-    first, gains = choices[0], dict[str, dict[str, Any]]()
-    for choice, configuration in zip(choices, plan.configurations, strict=True):
-        if choice.plant == first.plant:
-            law = with_law_settings(load_over(plan.settings, configuration.overrides)).description()["law"]
-            gains[choice.law] = law
+    compared, gains = list[Row](), dict[str, dict[str, Any]]()
+    for i, (choice, configuration) in enumerate(zip(choices, plan.configurations, strict=True)):
+        settings = with_law_settings(load_over(plan.settings, configuration.overrides))
+        if choice.plant == choices[0].plant:
+            gains[choice.law] = settings.description()["law"]
+        figures = _over_seeds(rows[i * plan.seeds : (i + 1) * plan.seeds])
+        compared.append({**choice._asdict(), **_proven(settings), **figures})
     return Laws(
         duration_s=plan.duration_s,
         seeds=plan.seeds,
@@ -293,23 +283,35 @@ def run_comparison(
         period_ms=plan.settings.loop.period * 1e3,
         within_deg=within_deg,
         margin_duration_s=PUSHED_S,
-        margin_at=f"{first.bits} bits",
+        margin_at=f"{choices[0].bits} bits",
         gains=gains,
-        rows=[_law_row(choice, rows[i * plan.seeds : (i + 1) * plan.seeds]) for i, choice in enumerate(choices)],
+        rows=compared,
         margins=[{"law": law, "plant": plant, **of[law, plant]} for law, plant in searched],
         out=None if out is None else str(out),
     )
 
 
-def _law_row(choice: Choice, rows: Sequence[Row]) -> Row:
-    """The row of a combination, of those of its seeds."""
-    figures: Row = choice._asdict() | dict.fromkeys(("z_track", "u_total", *_WORST, _MEANS[-1], "bits_per_s", "reason"))
+def _proven(settings: Settings) -> Row:
+    """What is proven of a configuration; of a user's law that certifies itself only whether it holds."""
+    try:
+        certificate = certify_any(settings, margins=False)
+    except (NoTheoremError, BoundlessError):
+        return dict.fromkeys(_PROVEN)
+    return {name: getattr(certificate, name, None) for name in _PROVEN}
+
+
+def _over_seeds(rows: Sequence[Row]) -> Row:
+    """Figures of a combination, of those of its seeds."""
     if reasons := [row["reason"] for row in rows if row["reason"] is not None]:
         several = f"{len(reasons)} of {len(rows)} seeds: " if len(rows) > 1 else ""
-        return figures | {"reason": f"{several}{reasons[0]}"}
-    figures |= {name: fmean(row[name] for row in rows) for name in _MEANS}
-    figures |= {name: max(row[name] for row in rows) for name in _WORST}
-    return figures | {"bits_per_s": fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)}
+        return {**dict.fromkeys((*_MEANS, *_WORST, "bits_per_s", "spread")), "reason": f"{several}{reasons[0]}"}
+    return {
+        **{name: fmean(row[name] for row in rows) for name in _MEANS},
+        **{name: max(row[name] for row in rows) for name in _WORST},
+        "bits_per_s": fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows),
+        "spread": {name: stdev(row[name] for row in rows) for name in _MEANS} if len(rows) > 1 else None,
+        "reason": None,
+    }
 
 
 # ── margins of any law on any plant: runs frame by frame, without a watchdog ──
@@ -391,53 +393,61 @@ class Late(Plant):
 
 # ── as text ──
 
+_COLUMNS: Final = (
+    Column("z_track 10⁻⁴ s", "z_track", "{:.1f}", 1e4),
+    Column("u_total V²·s", "u_total", "{:.0f}"),
+    Column("settled", "second_half_error_deg", "{:.2f}°"),
+    Column("changes/s", "command_changes_per_s", "{:.0f}"),
+    Column("kbit/s", "bits_per_s", "{:.1f}", 1e-3),
+)
+_SURVIVED: Final = (
+    Column("delay", "delay_ms", "{:g} ms", missing="none"),
+    Column("frames lost in a row", "lost_frames", "{}", missing="none"),
+)
+_BOUND: Final = Column("bound", "pointwise_deg", "{:.2f}°")
+_HOLDS: Final = {True: "holds", False: "no", None: "–"}
+
 
 def sheets(laws: Laws) -> Sheets:
-    """Figures of each combination, then what each law survives."""
-    for (plant, sensors, wind, bits), found in groupby(laws.rows, itemgetter("plant", "sensors", "wind", "bits")):
-        around = [f"sensors and wind: {wind}"] if sensors == wind else [f"sensors: {sensors}", wind]
-        rows = list(found)
-        yield " · ".join([plant, *around, f"{bits} bits"]), list(map(_cells, rows))
-        if failed := [f"{row['law']}: {row['reason']}" for row in rows if row["reason"] is not None]:
+    """A table for each plant, its sensors and bits: a line is a law, with what it survives where that was searched."""
+    margins = {(each["law"], each["plant"]): each for each in laws.margins}
+    plants = set[str]()
+    for (plant, sensors, bits), found in groupby(laws.rows, itemgetter("plant", "sensors", "bits")):
+        rows, first = list(found), plant not in plants
+        plants.add(plant)
+        of_law = {law: list(each) for law, each in groupby(rows, itemgetter("law"))}
+        lines = []
+        for law, each in of_law.items():
+            cells = {"law": law, "bound": _BOUND.text(each[0])}
+            cells["certificate"] = "; ".join(dict.fromkeys(_HOLDS[row["holds"]] for row in each))
+            cells |= {column.title: "; ".join(map(column.text, each)) for column in _COLUMNS}
+            if first:
+                cells |= {column.title: column.text(margins[law, plant]) for column in _SURVIVED}
+            lines.append(cells)
+        winds = "; ".join(dict.fromkeys(row["wind"] for row in rows))
+        yield f"{plant} · sensors: {sensors} · {bits} bits · {winds}", lines
+        failed = [f"{row['law']}, {row['wind']}: {row['reason']}" for row in rows if row["reason"] is not None]
+        if failed:
             yield "\n".join(failed), []
-    for plant, margins in groupby(laws.margins, itemgetter("plant")):
-        title = f"{plant} · calm · {laws.margin_at} · survived with an error within {laws.within_deg:g}°"
-        survive = []
-        for each in margins:
-            delay = "none" if each["delay_ms"] is None else f"{each['delay_ms']:g} ms"
-            lost = "none" if each["lost_frames"] is None else str(each["lost_frames"])
-            survive.append({"law": each["law"], "delay": delay, "frames lost in a row": lost})
-        yield title, survive
+    yield from ((note, []) for note in _notes(laws))
+
+
+def _notes(laws: Laws) -> list[str]:
     bandwidth, damping = (
         "/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (laws.bandwidth, laws.damping_ratio)
     )
-    yield (
+    seeds = f"means of seeds 0 to {laws.seeds - 1}" if laws.seeds > 1 else "seed 0"
+    notes = [
         f"Tuned to ωₙ = {bandwidth} rad/s and ζ = {damping} of the linearised error, which the paper's gains have "
-        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured.",
-        [],
-    )
-    yield (
-        f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
-        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
-        "that act later, or of which so many in a row never do, again and again, up to 1 s.",
-        [],
-    )
-    if laws.out is not None:
-        yield f"All experiments: {laws.out}", []
-
-
-def _cells(row: Row) -> dict[str, str]:
-    cells = {"law": row["law"]}
-    for title, name, scale, form in (
-        ("z_track 10⁻⁴ s", "z_track", 1e4, "{:.1f}"),
-        ("u_total V²·s", "u_total", 1, "{:.0f}"),
-        ("largest", "max_error_deg", 1, "{:.1f}°"),
-        ("settled", "second_half_error_deg", 1, "{:.2f}°"),
-        ("changes/s", "command_changes_per_s", 1, "{:.0f}"),
-        ("kbit/s", "bits_per_s", 1e-3, "{:.1f}"),
-    ):
-        cells[title] = "–" if row[name] is None else form.format(row[name] * scale)
-    return cells
+        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured. "
+        "Γ = 0: the same law without adaptation.",
+        "Bound: proven of the error at every instant, in the end, for the paper's body; certificate: whether one is "
+        "proven of this plant, too (lab certify says what fails); – without a theorem, or without a set.",
+        f"{laws.duration_s:g} s each, {seeds}, sent on change. Settled is the largest error of the second half, of any "
+        f"seed. Survived with an error within {laws.within_deg:g}°, calm, for {laws.margin_duration_s:g} s, without a "
+        "watchdog: commands that act later, or of which so many in a row never do, again and again, up to 1 s.",
+    ]
+    return notes if laws.out is None else [*notes, f"All experiments: {laws.out}"]
 
 
 # ── as a figure ──
@@ -459,73 +469,49 @@ def draw_laws(laws: Laws, path: Path) -> None:
     in a row, with their periods. A law without figures has a cross. Raises OutputError if the file's name is wrong, or
     it cannot be written.
     """
-    from aeroloop.service.report.figure_style import figure_style, save_as
-
-    with figure_style():
-        save_as(_figure(laws), path)
-
-
-def _figure(laws: Laws) -> Figure:
     from matplotlib.figure import Figure
-
-    from aeroloop.service.report.figure_style import WIDTH_IN, logarithmic
-
-    place = itemgetter("plant", "sensors")
-    groups = {where: list(each) for where, each in groupby(sorted(laws.rows, key=place), place)}
-    kinds, bits = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits"))
-    height = 0.7 + len(groups) * (0.75 + 0.17 * len(kinds))
-    figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
-    panels = figure.subplots(len(groups), len(_PANELS) + 1, sharey=True, squeeze=False)
-    for line, ((plant, sensors), found) in zip(panels, groups.items(), strict=True):
-        for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
-            values = [factor * (row[name] or 0) for row in found]
-            if is_logarithmic and max(values) > 0:
-                logarithmic(panel, "x", (1, 2, 5))
-            for row, value in zip(found, values, strict=True):
-                _mark(panel, row, value, kinds.index(row["law"]), _SHAPES[bits.index(row["bits"]) % len(_SHAPES)])
-            panel.set_xlabel(label)
-        for margin in laws.margins:
-            if margin["plant"] == plant:
-                y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
-                for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
-                    line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
-        line[-1].set_xlabel("survived [ms]")
-        line[0].set_yticks(range(len(kinds)), kinds)
-        line[0].set_ylim(len(kinds) - 0.4, -0.6)
-        line[0].set_ylabel(f"{plant}, {sensors}")
-    figure.legend(handles=_legend(laws, bits), loc="outside lower center", ncols=6)
-    return figure
-
-
-def _colours() -> dict[str, str]:
-    from aeroloop.service.report.figure_style import BLUE, ORANGE
-
-    return {"calm": BLUE, "wind": ORANGE}
-
-
-def _mark(panel: Axes, row: Row, value: float, line: int, shape: str) -> None:
-    colour = _colours().get(row["wind"], "#222222")
-    y = line + 0.13 * (1 if row["wind"] == "wind" else -1)  # marks of one law that would cover each other
-    if row["reason"] is not None:
-        panel.plot(0.97, y, "x", color=colour, markersize=4, transform=panel.get_yaxis_transform())
-    else:
-        panel.plot(value, y, shape, color=colour, markersize=4, markerfacecolor="none", markeredgewidth=0.9)
-
-
-def _legend(laws: Laws, bits: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    winds = {name: colour for name, colour in _colours().items() if any(row["wind"] == name for row in laws.rows)}
-    hollow: dict[str, Any] = {"color": "0.4", "markerfacecolor": "none", "linestyle": "none", "markersize": 4}
-    bars = (("0.75", "delay"), ("white", "frames lost in a row"))
-    failed = [Line2D([], [], marker="x", label="did not last", **hollow)]
-    return [
-        *(Line2D([], [], color=colour, linewidth=4, label=name) for name, colour in winds.items()),
-        *(
-            Line2D([], [], marker=_SHAPES[i % len(_SHAPES)], label=f"{pair} bits", **hollow)
-            for i, pair in enumerate(bits)
-        ),
-        *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
-        *(failed if any(row["reason"] for row in laws.rows) else []),
-    ]
+    from aeroloop.service.report.figure_style import BLACK, BLUE, ORANGE, WIDTH_IN, figure_style, logarithmic, save_as
+
+    kinds, bits, winds = (list(dict.fromkeys(row[name] for row in laws.rows)) for name in ("law", "bits", "wind"))
+    shapes = dict(zip(bits, cycle(_SHAPES), strict=False))
+    colours = {wind: {"calm": BLUE, "wind": ORANGE}.get(wind, BLACK) for wind in winds}
+    places = dict.fromkeys((row["plant"], row["sensors"]) for row in laws.rows)
+    with figure_style():
+        height = 0.7 + len(places) * (0.75 + 0.17 * len(kinds))
+        figure = Figure(figsize=(WIDTH_IN[2], height), layout="constrained")
+        panels = figure.subplots(len(places), len(_PANELS) + 1, sharey=True, squeeze=False)
+        for line, place in zip(panels, places, strict=True):
+            found = [row for row in laws.rows if (row["plant"], row["sensors"]) == place]
+            for panel, (label, name, factor, is_logarithmic) in zip(line, _PANELS, strict=False):
+                if is_logarithmic and any(row[name] for row in found):
+                    logarithmic(panel, "x", (1, 2, 5))
+                panel.set_xlabel(label)
+                for row in found:
+                    y = kinds.index(row["law"]) + (0.13 if row["wind"] == "wind" else -0.13)  # so that none is covered
+                    hollow = marks(colours[row["wind"]], face="none")
+                    if row["reason"] is not None:
+                        panel.plot(0.97, y, "x", transform=panel.get_yaxis_transform(), **hollow)
+                    else:
+                        panel.plot(row[name] * factor, y, shapes[row["bits"]], **hollow)
+            for margin in laws.margins:
+                if margin["plant"] == place[0]:
+                    y, lost_ms = kinds.index(margin["law"]), (margin["lost_frames"] or 0) * laws.period_ms
+                    for offset, length, face in ((-0.14, margin["delay_ms"] or 0, "0.75"), (0.14, lost_ms, "white")):
+                        line[-1].barh(y + offset, length, height=0.24, color=face, edgecolor="0.4", linewidth=0.5)
+            line[-1].set_xlabel("survived [ms]")
+            line[0].set_yticks(range(len(kinds)), kinds)
+            line[0].set_ylim(len(kinds) - 0.4, -0.6)
+            line[0].set_ylabel(", ".join(place))
+        bars = (("0.75", "delay"), ("white", "frames lost in a row"))
+        failed = ["did not last"] if any(row["reason"] for row in laws.rows) else []
+        legend = [
+            *(Line2D([], [], color=colour, linewidth=4, label=wind) for wind, colour in colours.items()),
+            *(Line2D([], [], marker=shape, label=f"{of} bits", **marks("0.4")) for of, shape in shapes.items()),
+            *(Patch(facecolor=face, edgecolor="0.4", linewidth=0.5, label=label) for face, label in bars),
+            *(Line2D([], [], marker="x", label=label, **marks("0.4")) for label in failed),
+        ]
+        figure.legend(handles=legend, loc="outside lower center", ncols=6)
+        save_as(figure, path)

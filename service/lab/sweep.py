@@ -28,7 +28,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import cache, lru_cache, partial
 from hashlib import sha256
 from importlib.metadata import version
@@ -52,6 +52,21 @@ Sheets: TypeAlias = Iterator[tuple[str, list[dict[str, str]]]]
 """A result as text: tables, each a title and rows, column to text; without rows a paragraph."""
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with the number done and the number in all."""
+
+
+class Column(NamedTuple):
+    """A column of a printed table: a figure of a row as text."""
+
+    title: str
+    name: str
+    form: str  # as of `str.format`
+    scale: float = 1
+    missing: str = "–"
+
+    def text(self, row: Row) -> str:
+        """The cell of a row."""
+        value = row[self.name]
+        return self.missing if value is None else self.form.format(value * self.scale)
 
 
 class SweepError(AeroloopError):
@@ -327,18 +342,16 @@ class RowFile:
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows = path, dict[Key, Row]()
-        try:
-            self._file = path.open("a+b", buffering=0)
-        except OSError as error:
-            raise SweepError(f"{path} cannot be used: {error.strerror}") from None
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._read()
-        except BaseException as error:
-            self.close()
-            if isinstance(error, BlockingIOError):
+        with ExitStack() as on_failure:
+            try:
+                self._file = on_failure.enter_context(path.open("a+b", buffering=0))
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
                 raise SweepError(f"{path} is in use by another sweep") from None
-            raise
+            except OSError as error:
+                raise SweepError(f"{path} cannot be used: {error.strerror}") from None
+            self._read()
+            on_failure.pop_all()
 
     def _read(self) -> None:
         self._file.seek(0)
@@ -431,20 +444,17 @@ def sweep_rows(plan: SweepPlan, workers: Workers, out: Path | None, report: Prog
     Raises:
         SweepError: As of `RowFile` and `Workers.stream`.
     """
-    file = None if out is None else RowFile(rows_file(out))
-    rows, keys, runs = file.rows if file else {}, plan.keys(), plan.runs()
-    missing = [i for i, key in enumerate(keys) if key not in rows]
-    report(done := len(keys) - len(missing), len(keys))
-    try:
+    with ExitStack() as at_end:
+        file = None if out is None else at_end.enter_context(closing(RowFile(rows_file(out))))
+        rows, keys, runs = file.rows if file else {}, plan.keys(), plan.runs()
+        missing = [i for i, key in enumerate(keys) if key not in rows]
+        report(done := len(keys) - len(missing), len(keys))
         work = partial(figures_row, duration_s=plan.duration_s)
         for number, row in workers.stream(work, [runs[i] for i in missing]):
             if file:
                 file.append(keys[missing[number]], row)
             rows[keys[missing[number]]] = row
             report(done := done + 1, len(keys))
-    finally:
-        if file:
-            file.close()
     return [rows[key] for key in keys]
 
 

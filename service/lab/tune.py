@@ -25,7 +25,7 @@ from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.figures import Floats
 from aeroloop.service.lab.experiment import LoopEndedError, experiment
 from aeroloop.service.lab.laws import PUSHED_S, survived
-from aeroloop.service.lab.sweep import Progress, Row, Sheets, Workers, run_of, with_seed
+from aeroloop.service.lab.sweep import Column, Progress, Row, Sheets, Workers, run_of, with_seed
 from aeroloop.service.theorem.any_law import certify_any
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
@@ -511,26 +511,31 @@ def _outcome(tuning: Tuning) -> str:
     return f"Better gains found: in the held-out set the cost changes by {after / before - 1:+.1%}."
 
 
+_FIGURES: Final = (
+    Column("cost, 1e-4 s", "cost", "{:.2f}", 1e4),
+    Column("z_track, 1e-4 s", "z_track", "{:.2f}", 1e4),
+    Column("u_total, V²·s", "u_total", "{:.0f}"),
+    Column("error in 2nd half, deg", "settled_deg", "{:.2f}"),
+    Column("saturated ticks", "saturated", "{:.2%}"),
+    Column("command changes/s", "changes_per_s", "{:.1f}"),
+    Column("runs that trip", "trips", "{:.0f}"),
+)
+_SURVIVED: Final = (
+    Column("delay survived, ms", "delay_ms", "{:g}", missing="none"),
+    Column("frames lost in a row", "lost_frames", "{:g}", missing="none"),
+)
+
+
 def _figures(tuning: Tuning) -> Iterator[dict[str, str]]:
-    both = tuning.before, tuning.after
+    both, limits = (tuning.before, tuning.after), tuning.limits.model_dump(exclude_none=True)
     columns = ("training: before", "training: after", "held out: before", "held out: after", "limit")
-    for label, name, scale, form in (
-        ("cost, 1e-4 s", "cost", 1e4, "{:.2f}"),
-        ("z_track, 1e-4 s", "z_track", 1e4, "{:.2f}"),
-        ("u_total, V²·s", "u_total", 1, "{:.0f}"),
-        ("error in 2nd half, deg", "settled_deg", 1, "{:.2f}"),
-        ("saturated ticks", "saturated", 1, "{:.2%}"),
-        ("command changes/s", "changes_per_s", 1, "{:.1f}"),
-        ("runs that trip", "trips", 1, "{:.0f}"),
-    ):
-        values = [side[part][name] for part in ("training", "held_out") for side in both]
-        cells = ["–" if value is None else form.format(value * scale) for value in values]
-        limit = getattr(tuning.limits, name, None)
-        yield {"": label} | dict(zip(columns, [*cells, "" if limit is None else form.format(limit)], strict=True))
-    for label, name in (("delay survived, ms", "delay_ms"), ("frames lost in a row", "lost_frames")):
-        survives = [side[name] for side in both]
-        cells = ["none" if value is None else f"{value:g}" for value in survives]
-        yield {"": label} | dict(zip(columns, [*cells, "", "", ""], strict=True))
+    for figure in _FIGURES:
+        cells = [figure.text(side[part]) for part in ("training", "held_out") for side in both]
+        limit = figure.text(limits) if figure.name in limits else ""
+        yield {"": figure.title} | dict(zip(columns, [*cells, limit], strict=True))
+    for figure in _SURVIVED:
+        cells = [figure.text(side) for side in both]
+        yield {"": figure.title} | dict(zip(columns, [*cells, "", "", ""], strict=True))
 
 
 def _notes(tuning: Tuning) -> Iterator[str]:

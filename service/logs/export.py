@@ -26,7 +26,7 @@ from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, SessionKey, Unknown
-from aeroloop.service.logs.table import Column, Kind, columns_of, true_state
+from aeroloop.service.logs.table import Column, TrueStates, columns_of
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
@@ -146,10 +146,15 @@ def _write_table(
     pieces = _pieces(recording, chosen, times_s, truths)
     if (first := next(pieces, None)) is None:
         raise ExportError(f"{recording.name} has no answered measurement to export")
-    if to == "mat":
-        rows = _write_mat(part, facts, [first, *pieces])
-    else:
-        rows = _write_arrow(part, facts, first, pieces, csv=to == "csv")
+    fields = [
+        pa.field(
+            column.name, pa.type_for_alias(column.kind), True, {"unit": column.unit, "description": column.description}
+        )
+        for column in first
+    ]
+    schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
+    batches = (pa.RecordBatch.from_arrays(list(map(_values, one)), schema=schema) for one in chain([first], pieces))
+    rows = _write_mat(part, schema, batches) if to == "mat" else _write_arrow(part, schema, batches, csv=to == "csv")
     damages = [*recording.unread, *([f"malformed: {malformed} of truth"] if malformed else [])]
     return rows, [column.name for column in first], damages
 
@@ -171,66 +176,56 @@ def _pieces(
 
 
 def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
-    """True states of sessions in order: tick, attitude, rate, voltages; and how many messages are malformed."""
+    """Rows of the true states of some sessions, and how many messages are malformed."""
     actuators: dict[str, dict[str, int]] = {vehicle: {} for vehicle, _ in chosen}
-    for which in chosen:
-        actuators[which[0]][which[1]] = recording.settings(which).wire.actuators
-    found: dict[SessionKey, list[tuple[float, ...]]] = {which: [] for which in chosen}
+    for vehicle, session in chosen:
+        actuators[vehicle][session] = recording.settings((vehicle, session)).wire.actuators
+    found = {vehicle: TrueStates(its) for vehicle, its in actuators.items()}
     malformed = 0
-    for vehicle, message in recording.messages(
-        lambda address: address.vehicle if address.topic.name == "truth" and address.vehicle in actuators else None
+    for states, message in recording.messages(
+        lambda address: found.get(address.vehicle) if address.topic.name == "truth" else None
     ):
         try:
-            true = true_state(message.data, actuators[vehicle])
+            states.add(message.data)
         except ValueError:
             malformed += 1
-            continue
-        if true is not None and true.session is not None and true.session_tick is not None:
-            row = true.session_tick, *true.attitude, *true.rate, *true.voltages
-            found[vehicle, true.session].append(row)
-    columns = {which: 8 + actuators[which[0]][which[1]] for which in chosen}
-    return {which: np.array(sorted(its)).reshape(-1, columns[which]) for which, its in found.items()}, malformed
+    return {which: found[which[0]].rows(which[1]) for which in chosen}, malformed
 
 
 # ── Files ──
 
 
-def _write_arrow(
-    path: Path, facts: dict[str, Any], first: Sequence[Column], more: Iterator[Sequence[Column]], *, csv: bool
-) -> int:
-    """Write Parquet or CSV by Arrow; returns the number of rows.
+def _values(column: Column) -> Any:
+    """A column of an Arrow table; NaN is null."""
+    values = column.values
+    gaps = np.isnan(values) if values.dtype == np.float64 else None
+    if column.kind == "bool":
+        values = np.nan_to_num(values).astype(np.bool_)
+    return pa.array(values, pa.type_for_alias(column.kind), mask=gaps)
+
+
+def _write_arrow(path: Path, schema: Any, batches: Iterator[Any], *, csv: bool) -> int:
+    """Write Parquet or CSV; returns the number of rows.
 
     CSV is as of RFC 4180. A number has enough digits to be read back exactly; a missing one is empty. Its booleans are
     numbers: a reader that guesses types takes `true` beside an empty cell for text.
     """
-    kinds: list[Kind] = ["int8" if csv and column.kind == "bool" else column.kind for column in first]
-    fields = [
-        pa.field(column.name, pa.type_for_alias(kind), True, {"unit": column.unit, "description": column.description})
-        for column, kind in zip(first, kinds, strict=True)
-    ]
-    schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
     if csv:
+        schema = pa.schema([field.with_type(pa.int8()) if field.type == pa.bool_() else field for field in schema])
         options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
         writer: Any = pyarrow.csv.CSVWriter(path, schema, write_options=options)
     else:  # a dictionary of doubles makes the file a third larger and its writing slower, quantized or not
-        texts = [column.name for column in first if column.kind == "string"]
+        texts = [field.name for field in schema if field.type == pa.string()]
         writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
     rows = 0
     with writer:
-        for columns in chain([first], more):
-            arrays = []
-            for column, kind in zip(columns, kinds, strict=True):
-                values = column.values
-                gaps = np.isnan(values) if values.dtype == np.float64 else None
-                if kind in ("bool", "int8"):
-                    values = np.nan_to_num(values).astype(kind)
-                arrays.append(pa.array(values, pa.type_for_alias(kind), mask=gaps))
-            writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
-            rows += len(columns[0].values)
+        for batch in batches:
+            writer.write_batch(batch.cast(schema))
+            rows += len(batch)
     return rows
 
 
-def _write_mat(path: Path, facts: dict[str, Any], pieces: Sequence[Sequence[Column]]) -> int:
+def _write_mat(path: Path, schema: Any, batches: Iterator[Any]) -> int:
     """Write a struct `aeroloop`, with a column vector of doubles for each column; returns the number of rows.
 
     Missing values are NaN. `published_ns` is int64, as a double does not hold it. `vehicle` and `session` are numbers,
@@ -238,22 +233,22 @@ def _write_mat(path: Path, facts: dict[str, Any], pieces: Sequence[Sequence[Colu
     """
     import scipy.io  # slow to import, and needed here only
 
-    struct: dict[str, Any] = {}
-    for parts in zip(*pieces, strict=True):
-        values, name = np.concatenate([part.values for part in parts]), parts[0].name
-        if parts[0].kind == "string":
-            texts = list(dict.fromkeys(values))
-            struct[f"{name}s"] = np.array(texts, dtype=object)
-            values = np.array([texts.index(text) + 1 for text in values])
-        struct[name] = values.astype(np.int64 if name == "published_ns" else np.float64)
+    table, struct = pa.Table.from_batches(batches, schema), dict[str, Any]()
+    for field, column in zip(schema, table.columns, strict=True):
+        if field.type == pa.string():
+            texts = column.combine_chunks().dictionary_encode()
+            struct[f"{field.name}s"] = np.array(texts.dictionary.to_pylist(), dtype=object)
+            column = pa.array(texts.indices.to_numpy() + 1)
+        struct[field.name] = column.cast(pa.int64() if field.name == "published_ns" else pa.float64()).to_numpy()
     if (size := sum(values.nbytes for values in struct.values())) > MAT_LIMIT:
         raise ExportError(
             f"a MATLAB file holds 2 GiB, and these rows take {size / 2**30:.1f} GiB; use --to parquet, "
             "which MATLAB reads by parquetread"
         )
-    struct["units"] = {column.name: column.unit for column in pieces[0]}
-    struct["descriptions"] = {column.name: column.description for column in pieces[0]}
-    struct |= {name: json.dumps(fact) for name, fact in facts.items() if name not in struct}
+    for name in ("unit", "description"):
+        struct[f"{name}s"] = {field.name: field.metadata[name.encode()].decode() for field in schema}
+    facts = {key.decode().removeprefix("aeroloop."): value.decode() for key, value in schema.metadata.items()}
+    struct |= {name: fact for name, fact in facts.items() if name not in struct}
     with path.open("wb") as file:
         scipy.io.savemat(file, {"aeroloop": struct}, long_field_names=True, oned_as="column")
-    return sum(len(columns[0].values) for columns in pieces)
+    return int(table.num_rows)

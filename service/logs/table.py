@@ -6,6 +6,7 @@ that the log lacks is NaN here, and the file format's own null in a file.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
@@ -30,18 +31,30 @@ _PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": 
 """Characters of a unit in a column's name."""
 
 
-def true_state(data: bytes, actuators: Mapping[str, int]) -> Truth | None:
-    """Parse the true state of a tick of one of these sessions, by name with its number of motors; None of another.
+class TrueStates:
+    """Collects the true states of some sessions of a vehicle, by name with the number of motors."""
 
-    Raises:
-        ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
-    """
-    truth = Truth.model_validate_json(data)
-    if truth.session is None or truth.session not in actuators or truth.session_tick is None:
-        return None
-    if not 0 <= truth.session_tick < NEVER or len(truth.voltages) != actuators[truth.session]:
-        raise ValueError("a true state of no tick of its session")
-    return truth
+    def __init__(self, actuators: Mapping[str, int]) -> None:
+        self._actuators = actuators
+        self._states = {session: array("d") for session in actuators}
+
+    def add(self, data: bytes) -> None:
+        """Add a message, unless it is of another session.
+
+        Raises:
+            ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
+        """
+        truth = Truth.model_validate_json(data)
+        if truth.session is None or truth.session not in self._actuators or truth.session_tick is None:
+            return
+        if not 0 <= truth.session_tick < NEVER or len(truth.voltages) != self._actuators[truth.session]:
+            raise ValueError("a true state of no tick of its session")
+        self._states[truth.session].extend((truth.session_tick, *truth.attitude, *truth.rate, *truth.voltages))
+
+    def rows(self, session: str) -> Array:
+        """Tick, q, ω and the motors' voltages, ascending; of a tick, the first. Shape (n, 8 + actuators)."""
+        rows = np.frombuffer(self._states[session]).reshape(-1, 8 + self._actuators[session])
+        return np.asarray(rows[np.unique(rows[:, 0], return_index=True)[1]])
 
 
 class Column(NamedTuple):

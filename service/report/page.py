@@ -20,6 +20,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from aeroloop.service.report import rows
 from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.review.report import Findings, Report, differences, flat
+from aeroloop.service.review.requirements import percent, seconds
 
 Json = dict[str, Any]
 HERE = Path(__file__).parent
@@ -35,7 +36,7 @@ def page(reports: Sequence[Report]) -> str:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {each.__name__: each for each in (rows.seconds, rows.percent, rows.shown, rows.count)}
+    environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count)}
     environment.filters["micros"] = rows.micros
     environment.tests["grave"] = rows.grave
     scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]

@@ -5,12 +5,12 @@ The page and the terminal show the same, so that a figure reads the same in both
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from json import dumps
 from typing import Any, Final, Literal, NamedTuple
 
 from aeroloop.service.review.report import Findings, Mark, Spread
-from aeroloop.service.review.requirements import value_of
+from aeroloop.service.review.requirements import FIGURES, Figure, percent, value_of
 
 
 class Value(NamedTuple):
@@ -28,40 +28,6 @@ class Delta(NamedTuple):
     word: Literal["better", "worse", "same"] | None
 
 
-class Figure(NamedTuple):
-    """Form of a figure of merit.
-
-    `path` leads to it in the findings, `what` says in a few words what it is, `main` figures are always shown, and
-    those that add up over time (`sums_up`) are comparable only between runs of the same duration.
-    """
-
-    path: str
-    name: str
-    unit: str
-    text: Callable[[float], str]
-    main: bool = False
-    what: str = ""
-    less_is_better: bool = True
-    sums_up: bool = False
-
-    @property
-    def key(self) -> str:
-        """Its name in `--json`."""
-        return self.path.partition(".")[0]
-
-    def delta(self, first: Value, value: Value, comparable: bool) -> Delta | None:
-        """Difference of a run's value to the first run's; None where either is unknown."""
-        if first.number is None or value.number is None:
-            return None
-        if first.text == value.text:
-            return Delta("0", "same")
-        apart = value.number - first.number
-        sign = "+" if apart > 0 else "−"
-        share = f" ({sign}{percent(abs(apart / first.number))} %)" if first.number else ""
-        word: Literal["better", "worse"] = "better" if apart < 0 else "worse"
-        return Delta(f"{sign}{self.text(abs(apart))}{share}", word if comparable else None)
-
-
 class Row(NamedTuple):
     """A figure of several runs: a value and its difference to the first one, run by run."""
 
@@ -77,20 +43,6 @@ def micros(value: float) -> str:
             return f"{value / scale:.3g} {unit}" if abs(value) < 1e3 * scale else f"{value / scale:,.0f} {unit}"
     return f"{value:.3g} µs" if value < 100 else f"{value:.0f} µs"
 
-
-def seconds(value: float) -> str:
-    """A time on the law's clock or a duration, to the millisecond: `12.346`."""
-    return f"{round(value, 3) + 0.0:,.3f}".replace("-", "−")  # + 0.0: no minus before a zero
-
-
-def percent(share: float) -> str:
-    """A share 0…1 in percent: two significant digits under 1 %, and `0` only for exactly 0."""
-    value = 100 * share
-    return "0" if not value else f"{value:.2g}" if value < 1 else f"{value:.1f}"
-
-
-_whole, _tenth, _hundredth = "{:,.0f}".format, "{:,.1f}".format, "{:,.2f}".format
-_fourth = "{:.4f}".format
 
 SPREADS: Final = {
     "latency": ("latency", "Latency: from a measurement to the command that answers it"),
@@ -111,42 +63,6 @@ UNMET: Final = {
 }
 """Premises of Lemma 1 that a true state may not satisfy, and what that means."""
 
-FIGURES: Final = (
-    Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
-            "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured", sums_up=True),
-    Figure("u_total", "control effort u_total", "V²·s", _tenth, True,
-            "∫ uᵀu dt, u the voltages as sent", sums_up=True),
-    Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
-            "angle from measured to desired attitude"),
-    Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
-    Figure("second_half_error_deg", "largest attitude error in the second half", "°", _hundredth),
-    Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
-    Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
-    Figure("latency_us.p99", "loop latency p99", "µs", _whole),
-    Figure("latency_us.max", "loop latency, longest", "µs", _whole),
-    Figure("age_us.p50", "age of measurements at the controller, p50", "µs", _whole),
-    Figure("age_us.p99", "age of measurements at the controller, p99", "µs", _whole),
-    Figure("measurement.frames_per_s", "measurements", "frames/s", _tenth, less_is_better=False),
-    Figure("measurement.bits_per_s", "measurements", "bit/s", _whole, True, "payload from plant to controller", False),
-    Figure("command.frames_per_s", "commands", "frames/s", _tenth, less_is_better=False),
-    Figure("command.bits_per_s", "commands", "bit/s", _whole, True, "payload from controller to plant", False),
-    Figure("gap_count", "gaps", "", _whole, sums_up=True),
-    Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent),
-    Figure("saturated.rate", "rate at the quantizer's limit", "%", percent),
-    Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent),
-    Figure("invalid", "frames without a valid value", "", _whole, sums_up=True),
-    Figure("missing_ticks", "ticks that were not recorded", "", _whole, sums_up=True),
-    Figure("lapses", "late, missed, malformed, stale, refused", "", _whole, sums_up=True),
-    Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
-    Figure("trips", "trips", "", _whole, sums_up=True),
-    Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
-    Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
-    Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
-    Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
-    Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
-    Figure("duration_s", "duration", "s", seconds, less_is_better=False),
-)  # fmt: skip
-
 
 def figure_rows(runs: Sequence[Findings]) -> list[Row]:
     """Main figures, and every other that at least one run has or has a reason for lacking.
@@ -163,9 +79,22 @@ def figure_rows(runs: Sequence[Findings]) -> list[Row]:
         ]
         if figure.main or any(value.text != "–" or value.why for value in values):
             comparable = [figure.less_is_better and not (figure.sums_up and apart) for apart in differ]
-            deltas = [figure.delta(values[0], value, may) for value, may in zip(values, comparable, strict=True)]
+            deltas = [_delta(figure, values[0], value, may) for value, may in zip(values, comparable, strict=True)]
             rows.append(Row(figure, values, deltas))
     return rows
+
+
+def _delta(figure: Figure, first: Value, value: Value, comparable: bool) -> Delta | None:
+    """Difference of a run's value to the first run's; None where either is unknown."""
+    if first.number is None or value.number is None:
+        return None
+    if first.text == value.text:
+        return Delta("0", "same")
+    apart = value.number - first.number
+    sign = "+" if apart > 0 else "−"
+    share = f" ({sign}{percent(abs(apart / first.number))} %)" if first.number else ""
+    word: Literal["better", "worse"] = "better" if apart < 0 else "worse"
+    return Delta(f"{sign}{figure.text(abs(apart))}{share}", word if comparable else None)
 
 
 class Duration(NamedTuple):

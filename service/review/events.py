@@ -8,7 +8,6 @@ nothing is decided by it. The first few hundred of each kind become marks and th
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from math import ceil, inf, isfinite
@@ -23,7 +22,7 @@ from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.session import Array, Integers, Session, SessionKey
-from aeroloop.service.logs.table import true_state
+from aeroloop.service.logs.table import TrueStates
 from aeroloop.service.review.report import FaultInterval, Mark
 
 MAX_MARKS: Final = 300
@@ -66,7 +65,7 @@ class Messages(NamedTuple):
 def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
     """Read the messages of a session and its vehicle; one that a restarted recorder recorded again counts once."""
     malformed, published, known = Counter[str](), list[Published](), set[int]()
-    states = array("d")  # rows of tick, q and ω
+    states = TrueStates({which[1]: actuators})
 
     def wanted(address: Address) -> Address | None:
         name = address.topic.name
@@ -77,9 +76,7 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
         name = address.topic.name
         try:
             if name == "truth":
-                truth = true_state(found.data, {which[1]: actuators})
-                if truth is not None and truth.session_tick is not None:
-                    states.extend((truth.session_tick, *truth.attitude, *truth.rate))
+                states.add(found.data)
             elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
                 known.add(identity)
                 message = _MODELS[name].model_validate_json(found.data)
@@ -90,9 +87,8 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
                     published.append(Published(at_ns, address.role or "recorder", message))
         except ValueError:  # a stranger may publish anything, such as 1e999
             malformed[name] += 1
-    rows = np.frombuffer(states).reshape(-1, 8)
-    k, first = np.unique(rows[:, 0].astype(np.int64), return_index=True)
-    truths = Truths(k, rows[first, 1:5], rows[first, 5:])
+    rows = states.rows(which[1])
+    truths = Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8])
     return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
 
 

@@ -1,48 +1,117 @@
-"""Limits of figures: `z_track=50e-4` holds if the figure is at most that, `theorem=1` if it is at least that."""
+"""Figures of merit of a review: their names, units and forms, and limits of them.
+
+The limit `z_track=50e-4` holds if the figure is at most that, `theorem=1` if it is at least that.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.figures import Figures
 from aeroloop.service.review.report import Check, Findings
 
-_DURATIONS: Final = [
-    f"{name}.{percentile}"
+
+def seconds(value: float) -> str:
+    """A time on the law's clock or a duration, to the millisecond: `12.346`."""
+    return f"{round(value, 3) + 0.0:,.3f}".replace("-", "−")  # + 0.0: no minus before a zero
+
+
+def percent(share: float) -> str:
+    """A share 0…1 in percent: two significant digits under 1 %, and `0` only for exactly 0."""
+    value = 100 * share
+    return "0" if not value else f"{value:.2g}" if value < 1 else f"{value:.1f}"
+
+
+_whole, _tenth, _hundredth = "{:,.0f}".format, "{:,.1f}".format, "{:,.2f}".format
+_fourth = "{:.4f}".format
+
+
+class Figure(NamedTuple):
+    """Form of a figure of merit.
+
+    `path` leads to it in the findings, `what` says in a few words what it is, `main` figures are always shown, and
+    those that add up over time (`sums_up`) are comparable only between runs of the same duration. A limit of it is in
+    `limit_unit`, or in `unit` if that is None.
+    """
+
+    path: str
+    name: str
+    unit: str
+    text: Callable[[float], str]
+    main: bool = False
+    what: str = ""
+    less_is_better: bool = True
+    sums_up: bool = False
+    limit_unit: str | None = None
+
+    @property
+    def key(self) -> str:
+        """Its name in `--json`."""
+        return self.path.partition(".")[0]
+
+
+FIGURES: Final = (
+    Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
+            "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured", sums_up=True, limit_unit="s"),
+    Figure("u_total", "control effort u_total", "V²·s", _tenth, True,
+            "∫ uᵀu dt, u the voltages as sent", sums_up=True),
+    Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
+            "angle from measured to desired attitude"),
+    Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
+    Figure("second_half_error_deg", "largest attitude error in the second half", "°", _hundredth),
+    Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
+    Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
+    Figure("latency_us.p99", "loop latency p99", "µs", _whole),
+    Figure("latency_us.max", "loop latency, longest", "µs", _whole),
+    Figure("age_us.p50", "age of measurements at the controller, p50", "µs", _whole),
+    Figure("age_us.p99", "age of measurements at the controller, p99", "µs", _whole),
+    Figure("measurement.frames_per_s", "measurements", "frames/s", _tenth, less_is_better=False),
+    Figure("measurement.bits_per_s", "measurements", "bit/s", _whole, True, "payload from plant to controller", False),
+    Figure("command.frames_per_s", "commands", "frames/s", _tenth, less_is_better=False),
+    Figure("command.bits_per_s", "commands", "bit/s", _whole, True, "payload from controller to plant", False),
+    Figure("gap_count", "gaps", "", _whole, sums_up=True),
+    Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent, limit_unit=""),
+    Figure("saturated.rate", "rate at the quantizer's limit", "%", percent, limit_unit=""),
+    Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent, limit_unit=""),
+    Figure("invalid", "frames without a valid value", "", _whole, sums_up=True),
+    Figure("missing_ticks", "ticks that were not recorded", "", _whole, sums_up=True),
+    Figure("lapses", "late, missed, malformed, stale, refused", "", _whole, sums_up=True),
+    Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
+    Figure("trips", "trips", "", _whole, sums_up=True),
+    Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
+    Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent, limit_unit=""),
+    Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
+    Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
+    Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
+    Figure("duration_s", "duration", "s", seconds, less_is_better=False),
+)  # fmt: skip
+
+_TIMING: Final = [
+    f"timing.{name}.{percentile}"
     for name in ("latency", "period", "measurement_delay", "command_delay")
     for percentile in ("p50", "p90", "p99", "p999", "max")
 ]
-_AGES: Final = [f"age_us.{percentile}" for percentile in ("p50", "p99", "max")]
-_THEOREM: Final = ("pointwise_radius", "pointwise_share", "pointwise_deg")
-_BY_UNIT: Final[dict[str, Sequence[str]]] = {
-    "s": ["duration_s", "z_track"],
-    "V²·s": ["u_total"],
-    "°": ["max_error_deg", "final_error_deg", "second_half_error_deg", "theorem.pointwise_deg"],
-    "": [
-        *("skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks", "invalid", "damages"),
-        *(f"saturated.{name}" for name in ("attitude", "rate", "voltage")),
-        *(f"theorem.{name}" for name in ("pointwise_radius", "pointwise_share", "held", "broken")),
-    ],
-    "µs": [
-        *(f"latency_us.{name}" for name in ("p50", "p99", "p999", "max")),
-        *(f"timing.{name}" for name in _DURATIONS),
-        *_AGES,
-    ],
-}
 
-UNITS: Final = {name: unit for unit, names in _BY_UNIT.items() for name in names}
-"""Figures that can have a limit, by their names in the findings, and their units."""
+UNITS: Final = {
+    **{
+        figure.path: figure.unit if figure.limit_unit is None else figure.limit_unit
+        for figure in FIGURES
+        if figure.key not in ("measurement", "command")
+    },
+    **dict.fromkeys(("latency_us.p999", "age_us.max", *_TIMING), "µs"),
+    "damages": "",
+}
+"""Figures that can have a limit, by their names in the findings, and the limit's unit."""
 
 SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
     "gaps": "gap_count",
-    **{name: f"timing.{name}" for name in _DURATIONS},
     "theorem": "theorem.held",
-    **{name: f"theorem.{name}" for name in _THEOREM},
     "lemma_broken": "theorem.broken",
-    **{path.replace("_us", ""): path for path in _AGES},
+    **{path.partition(".")[2]: path for path in UNITS if path.startswith(("timing.", "theorem.pointwise_"))},
+    **{path.replace("_us", ""): path for path in UNITS if path.startswith("age_us.")},
 }
 """Other names for some of them."""
 

@@ -14,59 +14,44 @@ import zstd from "@foxglove/wasm-zstd";
 await zstd.isLoaded;
 const decompressHandlers = { zstd: (data, size) => zstd.decompress(data, Number(size)) };
 
-/** Counts of messages by topic, with the first and last log time [ns] and the name of the schema. */
-class Counts {
-  topics = {};
-
-  add(channel, schema, message) {
-    const known = (this.topics[channel.topic] ??= {
-      schema: schema?.name ?? "",
-      count: 0,
-      first: message.logTime,
-      last: message.logTime,
-      bytes: 0,
-    });
-    known.count += 1;
-    known.bytes += message.data.byteLength;
-    if (message.logTime < known.first) known.first = message.logTime;
-    if (message.logTime > known.last) known.last = message.logTime;
-  }
+/** Count a message of a topic, its bytes, and the first and last log time [ns]. */
+function add(counts, topic, message) {
+  const known = (counts[topic] ??= { count: 0, bytes: 0, first: message.logTime, last: message.logTime });
+  known.count += 1;
+  known.bytes += message.data.byteLength;
+  if (message.logTime < known.first) known.first = message.logTime;
+  if (message.logTime > known.last) known.last = message.logTime;
 }
 
 async function asStream(path) {
   const reader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
-  const [schemas, channels, counts] = [new Map(), new Map(), new Counts()];
+  const [topics, counts] = [new Map(), {}];
   for await (const block of createReadStream(path)) {
     reader.append(block);
     for (let record; (record = reader.nextRecord()); ) {
-      if (record.type === "Schema") schemas.set(record.id, record);
-      else if (record.type === "Channel") channels.set(record.id, record);
-      else if (record.type === "Message") {
-        const channel = channels.get(record.channelId);
-        counts.add(channel, schemas.get(channel.schemaId), record);
-      }
+      if (record.type === "Channel") topics.set(record.id, record.topic);
+      else if (record.type === "Message") add(counts, topics.get(record.channelId), record);
     }
   }
   if (!reader.done()) throw new Error("the file has no end");
-  return counts.topics;
+  return counts;
 }
 
 async function byIndex(path) {
   const file = await open(path);
   try {
     const reader = await McapIndexedReader.Initialize({ readable: new FileHandleReadable(file), decompressHandlers });
-    const counts = new Counts();
+    const counts = {};
     let messages = 0n;
     for await (const message of reader.readMessages({ validateCrcs: true })) {
-      const channel = reader.channelsById.get(message.channelId);
-      counts.add(channel, reader.schemasById.get(channel.schemaId), message);
+      add(counts, reader.channelsById.get(message.channelId).topic, message);
       messages += 1n;
     }
     for await (const _ of reader.readMetadata()); // each must be where the index says
     for await (const _ of reader.readAttachments({ validateCrcs: true }));
     const counted = reader.statistics?.messageCount;
     if (counted !== messages) throw new Error(`the file's statistics count ${counted} messages, its index of ${messages}`);
-    return counts.topics;
+    return counts;
   } finally {
     await file.close();
   }

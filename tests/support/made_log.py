@@ -1,14 +1,16 @@
 """Synthetic logs without a network: controller and emulated plant, traces written as the recorder writes them.
 
-Both ends are the project's own: the emulator with its trace, the controller with its tick source and its trace. Only
-network and clocks are simulated, so the expected content of the log is exact.
+Both ends are the project's own: the emulator with its trace, the controller with its trace. Only network and clocks are
+simulated, so the expected content of the log is exact, also of a `rough_loop`, in which much goes otherwise.
 """
 
 from __future__ import annotations
 
+import random
 import threading
 from collections import Counter
 from collections.abc import Container, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
@@ -19,9 +21,10 @@ from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
-from aeroloop.protocol.messages.trace import ControllerRow, End, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.transport.history import Delivery as Message
 from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.session import telemetry_of
@@ -153,9 +156,72 @@ class ControllerEnd:
             self.publish()
             self.trace.state = self.controller.state.model_dump(mode="json")
 
+    def late(self, tick: int, frame: bytes) -> None:
+        """Take in a measurement that came when its tick was over: only its levels are used."""
+        self.controller.hold(frame)
+        at_ns = self._clock.monotonic_ns()
+        self.record(PlantTick(tick, frame, Received.LATE, at_ns, at_ns), None, 0)
+
     def publish(self, *, final: bool = False) -> None:
         payload = self.trace.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=final)
         self._messages.add("trace", payload, self._clock, "controller")
+
+
+@dataclass
+class Rough:
+    """A loop in which much goes otherwise, by chance, and what happened in it.
+
+    Attributes:
+        measured: Frames that the plant made, by session tick; UNCHANGED where it sent none.
+        commands: What the controller sent at each tick that it computed.
+        late: Measurements that came late.
+        acted: When the plant received the command that it acted on, on its clock, by the tick that it answers [ns].
+        sent: When the measurement of a tick was sent, on the plant's clock [ns].
+        outcomes: Of the plant's ticks, in order.
+    """
+
+    settings: Settings
+    chance: random.Random
+    messages: list[Logged] = field(default_factory=list)
+    measured: dict[int, bytes] = field(default_factory=dict)
+    commands: dict[int, bytes | None] = field(default_factory=dict)
+    late: int = 0
+    acted: dict[int, int] = field(default_factory=dict)
+    sent: dict[int, int] = field(default_factory=dict)
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    def happens(self, share: float) -> bool:
+        return self.chance.random() < share
+
+    def takes(self, usual_ns: int) -> int:
+        return round(self.chance.uniform(0.7, 1.3) * usual_ns)
+
+
+ROUGH_FAULTS: Final = (
+    "command:drop=0.3@0..0.1",
+    "command:duplicate=0.2@0..0.1",
+    "command:delay=0.006@0..0.05",
+    "rate.z:bias=0.05@0..0.1",
+)
+
+
+def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Rough:
+    """Run a loop in real time with hitches and faults of the plant, changes, and frames lost, late and twice.
+
+    The controller's clock may drift.
+    """
+    chance = random.Random(seed)
+    transmit = "on_change" if seed % 3 == 1 else "periodic"
+    settings = load(overrides=["plant.watchdog_s=0.1", f'wire.transmit="{transmit}"', *overrides])
+    rough = Rough(settings, chance)
+    references = (None, Hold(attitude=(0.0, 5.0, chance.uniform(-20, 20))), settings.reference)
+    changes: Changes = {
+        k: (Gains(C2=(chance.choice([0.1, 0.15, 0.2]),) * 3), chance.choice(references))
+        for k in range(1, ticks)
+        if rough.happens(0.003)
+    }
+    rough.messages = made(settings, ticks, changes, truth_every=10, rough=rough)
+    return rough
 
 
 def make_log(
@@ -204,15 +270,17 @@ def made(
     session: str = SESSION,
     at_ns: int = 0,
     injected: Mapping[int, str | None] = {},
+    rough: Rough | None = None,
 ) -> list[Logged]:
     """The messages of such a loop; arguments as of `make_log`.
 
     The session may have another name, and begin so long after the first instant of both clocks [ns]; each session is
-    of processes of its own.
+    of processes of its own. What goes otherwise by chance in a `rough` loop is noted there.
     """
     wire, loop = settings.wire, settings.loop
     messages = Messages()
-    plant_clock, clock = Clock("plant"), Clock("controller")
+    drift = rough.chance.choice([0.0, 1e-4, -5e-5]) if rough else 0.0
+    plant_clock, clock = Clock("plant"), Clock("controller", drift)
     emulator = Emulator(loop, wire, settings.plant, threading.Event())
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
 
@@ -238,14 +306,24 @@ def made(
         assert isinstance(endpoint.claim(claim), Grant)
         trace.follow(endpoint)
         end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)
-        arrival: Arrival | None = None
+        coming: list[Arrival] = []
+        overtaken: list[tuple[int, bytes]] = []  # measurements that are late
+        resumes = 0
         for k in range(ticks):
-            if k in skipped:
+            if rough and rough.happens(0.004):
+                resumes = k + rough.chance.randrange(20)
+            if k in skipped or k < resumes:
                 continue
             now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
             if k in injected:
                 fault = injected[k]
                 emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
+            elif rough and rough.happens(0.004):
+                emulator.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
+                trace.follow(endpoint)
+            arrived = [one for one in coming if one.at_ns <= plant_clock.monotonic_ns()]
+            arrival = arrived[-1] if arrived else None  # the newest wins
+            coming = coming[len(arrived) :]
             measurement = emulator.tick(arrival.frame if arrival else None, k)
             assert measurement is not None, endpoint.notices
             trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
@@ -253,21 +331,40 @@ def made(
                 messages.add("truth", truth.encode(), plant_clock, "plant")
             if k % 100 == 0 and (injected or settings.plant.faults):
                 publish(k)
-            arrival = None
-            if k in lost:
+            taken: bytes | None = None if k in lost else measurement
+            clock.now_ns = now_ns + (rough.takes(ONE_WAY_NS) if rough else ONE_WAY_NS)
+            if rough:
+                rough.measured[k], rough.sent[k] = measurement, plant_clock.monotonic_ns()
+                rough.outcomes.append(endpoint.outcome)
+                if endpoint.outcome is Outcome.ACTED and arrival is not None:
+                    rough.acted[endpoint.answered] = arrival.at_ns
+                if overtaken and rough.happens(0.5):
+                    end.late(*overtaken.pop(0))
+                    rough.late += 1
+                if measurement and rough.happens(0.04):
+                    taken = UNCHANGED if wire.transmit.measurement == "on_change" else None
+                    overtaken += [(k, measurement)] * rough.happens(0.5)
+            if taken is None:
                 continue
-            clock.now_ns = now_ns + ONE_WAY_NS
             if k in changes:
                 end.follow(k, *changes[k])
-            command = end.controller.tick(measurement, k)
-            received_as = Received.FRAME if measurement else Received.SILENT
+            command, received_ns = end.controller.tick(taken, k), clock.monotonic_ns()
+            if rough:
+                rough.commands[k] = command
+                clock.now_ns += rough.takes(200_000)
+            received_as = Received.FRAME if taken else Received.SILENT
             logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
-            received_ns = clock.monotonic_ns()
-            end.record(PlantTick(k, measurement, received_as, received_ns, received_ns), logged, received_ns)
+            end.record(PlantTick(k, taken, received_as, received_ns, received_ns), logged, clock.monotonic_ns())
             if k % 10 == 0 and end.controller.tick_index == k:
                 messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
             if command or (command is not None and loop.lockstep):
-                arrival = Arrival(command, plant_clock.at(now_ns + 2 * ONE_WAY_NS))
+                arrives_ns, copies = plant_clock.at(clock.now_ns + ONE_WAY_NS), 1
+                if rough:
+                    late_ns = rough.chance.randrange(20 * loop.period_ns) if rough.happens(0.005) else 0
+                    arrives_ns = plant_clock.at(clock.now_ns + rough.takes(ONE_WAY_NS)) + late_ns
+                    arrives_ns = max([arrives_ns, *(one.at_ns + 1 for one in coming)])
+                    copies = rough.chance.choice([0, 2]) if rough.happens(0.05) else 1
+                coming += [Arrival(command, arrives_ns + i) for i in range(copies)]
         end.publish(final=True)
         endpoint.release(session)
         trace.follow(endpoint)

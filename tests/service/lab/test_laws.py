@@ -18,10 +18,13 @@ from aeroloop.service.control.laws.baselines import response_of
 from aeroloop.service.lab import laws as module
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.laws import LAWS, Choice, Late, compare, largest_error_deg, last_good, survived
+from aeroloop.service.lab.sweep import with_seed
+from aeroloop.service.theorem.certificate import certify
 from tests.support.failing_laws import FAILING
 from tests.support.in_this_process import run_here
 
 SLOW = load(overrides=["loop.rate_hz=100"])
+NO_GAMMA = ", Γ = 0"
 RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 
 
@@ -35,10 +38,12 @@ def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:
 
 def test_by_default_every_law_of_ours_flies_both_plants_calm_and_in_wind_with_two_choices_of_bits() -> None:
     found = compared(SLOW)
-    assert len(found) == len(LAWS) * 2 * 2 * 2
+    assert {choice.law for choice in found} == {*LAWS, "adaptive, Γ = 0", "adaptive-torque, Γ = 0"}
+    assert len(found) == (len(LAWS) + 2) * 2 * 2 * 2
     for choice, settings in found.items():
         law, plant = settings.law, settings.plant
-        assert (law.kind, plant.kind, plant.wind.blowing) == (choice.law, choice.plant, choice.wind == "wind")
+        assert law.kind == {"adaptive, Γ = 0": "nonadaptive"}.get(choice.law, choice.law.removesuffix(", Γ = 0"))
+        assert (plant.kind, plant.wind.blowing) == (choice.plant, choice.wind == "wind")
         bits = (8, 8, 6) if choice.bits == "8/6" else (None,) * 3
         wire = settings.wire
         assert (wire.attitude.bits, wire.rate.bits, wire.voltage.bits) == bits
@@ -54,14 +59,31 @@ def test_others_have_the_response_that_the_configured_gains_give_and_a_configure
     own = load_over(SLOW, [f"law.C1={[*C1]}", f"law.C2={[*C2]}", "law.inertia=[0.02, 0.03, 0.04]"])
     laws = {choice.law: settings.law.model_dump() for choice, settings in compared(own, plants=["aero"]).items()}
     assert laws["adaptive"] == own.law.model_dump()
-    assert (laws["nonadaptive"]["C1"], laws["nonadaptive"]["C2"]) == (C1, C2)
     wn, zeta = response_of((0.02, 0.03, 0.04), C1, C2)
     for i, J in enumerate((0.02, 0.03, 0.04)):
         assert laws["pd"]["kp"][i] == pytest.approx(2 * J * wn[i] ** 2, rel=1e-4)
         assert laws["pd"]["kd"][i] == pytest.approx(2 * J * zeta[i] * wn[i], rel=1e-4)
+        assert (laws[f"adaptive{NO_GAMMA}"]["C1"][i], laws[f"adaptive{NO_GAMMA}"]["C2"][i]) == (C1[i], C2[i])
     mine = load_over(SLOW, ["law.kind=pd", "law.kp=[1, 2, 3]"])
     [settings] = compared(mine, laws=["pd"], bits=["8/6"], winds=["calm"], plants=["aero"]).values()
     assert settings.law == mine.law
+
+
+@pytest.mark.parametrize("configured", ["adaptive", "adaptive-torque"])
+def test_without_adaptation_a_law_is_the_same_but_for_its_adaptation_gains(configured: str) -> None:
+    """And what is known of the damping is the same for all laws, so that their bounds compare."""
+    own = load_over(SLOW, [f"law.kind={configured}", "law.damping_bound=0.02", "law.damping_estimate=[0, 0.01, 0.02]"])
+    found = compared(own, laws=["adaptive", "adaptive-torque", "pd"], bits=["8/6"], winds=["calm"], plants=["aero"])
+    laws = {choice.law: settings.law.model_dump() for choice, settings in found.items()}
+    for law in laws.values():
+        assert (law["damping_bound"], law["damping_estimate"]) == (0.02, (0.0, 0.01, 0.02))
+    for kind in ("adaptive", "adaptive-torque"):
+        law, without = laws[kind], laws[kind + NO_GAMMA]
+        assert all(any(law[name]) for name in law if name.startswith("Gamma"))
+        assert not any(any(without[name]) for name in without if name.startswith("Gamma"))
+        assert {name for name in law if law[name] != without.get(name)} == {
+            name for name in law if name.startswith("Gamma") or (name, kind) == ("kind", "adaptive")
+        }
 
 
 @pytest.mark.parametrize(
@@ -83,15 +105,23 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     run_here(monkeypatch)  # what workers bring back: test_workers.py
     out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
     laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
-    few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero", "--duration", "3", "--set", "loop.rate_hz=100"]
+    few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero"]
+    few += ["--duration", "3", "--seeds", "2", "--set", "loop.rate_hz=100"]
     assert execute(["lab", "laws", *laws, *few, "--out", str(out), "--figure", str(figure), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     pd, runaway, raising = found["rows"]
     # sent on change, which changes no figure but the frames'
-    figures = run_experiment(load_over(SLOW, ["law.kind=pd"]), 3.0)
-    for name in ("z_track", "u_total", "max_error_deg", "second_half_error_deg", "command_changes_per_s"):
-        assert pd[name] == pytest.approx(getattr(figures, name), rel=1e-4)  # the rule's gains have five digits
-    always = sum(direction.bits_per_s or 0 for direction in (figures.measurement, figures.command))
+    settings = load_over(SLOW, ["law.kind=pd"])
+    runs = [run_experiment(with_seed(settings, seed), 3.0) for seed in (0, 1)]
+    for name in ("z_track", "u_total", "command_changes_per_s"):
+        both = [getattr(run, name) for run in runs]
+        assert pd[name] == pytest.approx(sum(both) / 2, rel=1e-4)  # the rule's gains have five digits
+        assert pd["spread"][name] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-3)
+    for name in ("max_error_deg", "second_half_error_deg"):
+        assert pd[name] == pytest.approx(max(getattr(run, name) for run in runs), rel=1e-4)
+    assert pd["pointwise_deg"] == pytest.approx(certify(settings, margins=False).pointwise_deg, rel=1e-3)
+    assert (pd["holds"], runaway["holds"], runaway["pointwise_deg"]) == (False, None, None)
+    always = sum(direction.bits_per_s or 0 for direction in (runs[0].measurement, runs[0].command))
     assert 0 < pd["bits_per_s"] < always
     assert runaway["z_track"] is None
     assert "the loop ended after" in runaway["reason"]
@@ -100,8 +130,8 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     assert margins["pd"]["delay_ms"] > 0
     assert margins[RUNAWAY]["delay_ms"] is margins[RAISING]["lost_frames"] is None
     table = pq.read_table(out)
-    assert table["law"].to_pylist() == ["pd", RUNAWAY, RAISING]
-    assert table["delay_ms"].to_pylist() == [margins["pd"]["delay_ms"], None, None]
+    assert table["law"].to_pylist() == [kind for kind in ("pd", RUNAWAY, RAISING) for _ in range(2)]
+    assert table["delay_ms"].to_pylist() == [margins["pd"]["delay_ms"]] * 2 + [None] * 4
     assert imread(figure).size > 1e5
 
     before = out.read_bytes()
@@ -111,9 +141,12 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     assert out.read_bytes() == before
     assert execute(["lab", "laws", *laws, *few, "--markdown"]) == 0
     text = capsys.readouterr().out
-    assert f"| {RUNAWAY} | – |" in text
-    assert f"{RUNAWAY}: the loop ended after" in text
-    assert "| pd | none |" not in text
+    assert f"| {RUNAWAY} | – | – |" in text
+    assert f"{RUNAWAY}, calm: 2 of 2 seeds: the loop ended after" in text
+    assert "| none | none |" in text
+    [line] = [line for line in text.splitlines() if line.startswith("| pd |")]
+    assert line.startswith(f"| pd | {pd['pointwise_deg']:.2f}° | no | {pd['z_track'] * 1e4:.1f} |")
+    assert line.endswith(f"| {margins['pd']['delay_ms']:g} ms | {margins['pd']['lost_frames']} |")
 
 
 def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,17 @@ from aeroloop.service.logs.session import Missing
 from aeroloop.service.logs.trace_index import TraceIndex
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import contents, edited, rewrite, write_messages
-from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, VEHICLE, Logged, made, make_log, write
-from tests.support.rough_log import Known, rough_loop
+from tests.support.made_log import (
+    AN_OPERATORS_WORDS,
+    SESSION,
+    VEHICLE,
+    Logged,
+    Rough,
+    made,
+    make_log,
+    rough_loop,
+    write,
+)
 
 SEEDS = range(5)
 
@@ -35,8 +44,8 @@ def rows_of(message: Logged) -> int:
     return 0 if batch is None else batch.header.rows
 
 
-def written(path: Path, known: Known, messages: list[Logged] | None = None) -> Path:
-    return write(path, known.settings, known.messages.all if messages is None else messages)
+def written(path: Path, known: Rough, messages: list[Logged] | None = None) -> Path:
+    return write(path, known.settings, known.messages if messages is None else messages)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -57,8 +66,10 @@ def test_what_was_joined_is_what_happened_and_both_ends_replay_byte_for_byte(see
     assert ticks.k.tolist() == [k for k in sorted({*known.measured, *known.commands}) if k <= answered[-1]]
     assert findings.skipped_ticks == ticks.k[-1] - ticks.k[0] + 1 - len(answered)
     missed = [k for k in known.measured if k not in known.commands and k <= answered[-1]]
-    counted = {name: known.outcomes.count(outcome) for name, outcome in (("stale", Outcome.STALE),
-               ("repeated", Outcome.REPEATED), ("withheld", Outcome.WITHHELD))}  # fmt: skip
+    counted = {
+        name: known.outcomes.count(outcome)
+        for name, outcome in (("repeated", Outcome.REPEATED), ("withheld", Outcome.WITHHELD))
+    }
     expected = {"late": known.late, "missed": len(missed), **counted}
     assert {name: findings.lapses.get(name, 0) for name in expected} == expected
     for k, latency in zip(ticks.k.tolist(), ticks.latency_ns.tolist(), strict=True):
@@ -81,7 +92,7 @@ def test_one_way_delays_and_the_offset_are_found_on_clocks_that_differ_and_drift
 @pytest.mark.parametrize("seed", SEEDS[:3])
 def test_batches_that_come_twice_or_out_of_order_change_nothing(seed: int, tmp_path: Path) -> None:
     known, chance = rough_loop(seed), random.Random(seed)
-    messages = known.messages.all
+    messages = known.messages
     again = sorted(chance.choices(range(len(messages)), k=len(messages) // 2))
     doubled = [*messages, *(messages[i] for i in again)]
     late = chance.sample(range(len(messages)), len(messages) // 4)
@@ -102,7 +113,7 @@ def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, t
     A plant is only known from its start.
     """
     known, chance = rough_loop(seed, 2000, 'wire.transmit="periodic"'), random.Random(seed)
-    messages = list(known.messages.all)
+    messages = list(known.messages)
     for end in ("controller", "plant"):
         batches = [m for m in messages if end_of(m) == end and rows_of(m) and b'"changes"' not in m.payload]
         at = chance.randrange(1, len(batches) - 3)
@@ -110,7 +121,7 @@ def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, t
             messages.remove(gone)
     path = written(tmp_path / "a.mcap", known, messages)
     gone_rows = {
-        end: sum(rows_of(m) for m in known.messages.all if end_of(m) == end)
+        end: sum(rows_of(m) for m in known.messages if end_of(m) == end)
         - sum(rows_of(m) for m in messages if end_of(m) == end)
         for end in ("controller", "plant")
     }
@@ -122,7 +133,7 @@ def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, t
     left_out = {k for one in replayed.unknown for k in range(one.first_tick, one.last_tick + 1)}
     gone_ticks = {
         k
-        for m in known.messages.all
+        for m in known.messages
         if end_of(m) == "controller" and m not in messages and (batch := read_batch(m.payload))
         for k in batch.columns["tick"].tolist()
     }

@@ -24,32 +24,29 @@ VERBS: Final[dict[str, tuple[str, ...]]] = {
 """Every verb that writes a file that the user names."""
 
 
-def _symbolic_link(path: Path) -> str:
-    path.with_name("link.png").symlink_to(path)
-    return "link.png"
+def _copy(path: Path, name: str) -> str:
+    path.with_name(name).write_bytes(path.read_bytes())
+    return name
 
 
-def _hard_link(path: Path) -> str:
-    os.link(path, path.with_name("second.png"))
-    return "second.png"
+def _link(path: Path, name: str, hard: bool = False) -> str:
+    (os.link if hard else os.symlink)(path, path.with_name(name))
+    return name
 
 
-def _another_ending(path: Path) -> str:
-    path.with_name("renamed.png").write_bytes(path.read_bytes())
-    return "renamed.png"
-
-
-def _a_log_whose_head_is_lost(path: Path) -> str:
+def _emptied(path: Path, name: str) -> str:
     path.with_name("other.mcap").write_bytes(b"")
-    path.with_name("other.png").symlink_to("other.mcap")
-    return "other.png"
+    return _link(path.with_name("other.mcap"), name)
 
 
-def _relative_path(path: Path) -> str:
-    return f"../{path.parent.name}/{path.name}"
-
-
-NAMES: Final = (str, _relative_path, _symbolic_link, _hard_link, _another_ending, _a_log_whose_head_is_lost)
+NAMES: Final[dict[str, Callable[[Path], str]]] = {
+    "its own": str,
+    "a relative path": lambda path: f"../{path.parent.name}/{path.name}",
+    "a symbolic link": lambda path: _link(path, "link.png"),
+    "a hard link": lambda path: _link(path, "second.png", hard=True),
+    "another ending": lambda path: _copy(path, "renamed.png"),
+    "a log whose head is lost": lambda path: _emptied(path, "other.png"),
+}
 """Names of a log as an output."""
 
 
@@ -77,9 +74,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("named", NAMES)
 @pytest.mark.parametrize("verb", VERBS)
 def test_no_verb_overwrites_a_log_by_any_name_and_not_with_force(
-    here: Path, verb: str, named: Callable[[Path], str], capfd: pytest.CaptureFixture[str]
+    here: Path, verb: str, named: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    out = named(here / "a.mcap")
+    out = NAMES[named](here / "a.mcap")
     before = contents(here)
     for force in ((), ("--force",)):
         assert execute([out if word == "OUT" else word for word in VERBS[verb]] + [*force]) in (1, 2)

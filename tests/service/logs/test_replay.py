@@ -10,10 +10,8 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.figures import Figures, StreamFigures
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
-from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import review
 from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, START_NS, lockstep, made, make_log, write
 
@@ -108,44 +106,3 @@ def test_a_folder_is_read_as_one_run_in_the_order_of_time(tmp_path: Path) -> Non
     make_log(tmp_path / "whole" / "w.mcap", TICKS)
     parts, whole = review(tmp_path), review(tmp_path / "whole")
     assert (parts.z_track, parts.u_total, parts.duration_s) == (whole.z_track, whole.u_total, whole.duration_s)
-
-
-# Limits
-
-
-FIGURES = Figures(
-    duration_s=1.0,
-    z_track=0.004,
-    u_total=None,
-    max_error_deg=4.0,
-    final_error_deg=0.5,
-    measurement=StreamFigures(frames_per_s=500, bits_per_s=1),
-    command=StreamFigures(frames_per_s=500, bits_per_s=1),
-    skipped_ticks=2,
-    latency_us=None,
-    log=None,
-    trips=["tilted"],
-)
-
-
-@pytest.mark.parametrize(
-    ("limit", "holds"),
-    [
-        ("z_track=40e-4", True),
-        ("z_track=39e-4", False),
-        ("skipped_ticks=2", True),
-        ("skipped_ticks=1", False),
-        ("trips=0", False),
-        ("u_total=1e9", False),
-        ("latency_us.p99=1e9", False),
-    ],
-)
-def test_a_figure_is_held_to_its_limit_and_what_is_not_known_does_not_hold(limit: str, holds: bool) -> None:
-    assert Limit.parse(limit).holds(FIGURES) is holds
-
-
-@pytest.mark.parametrize("text", ["", "z_track", "z_track=", "z_track=x", "speed=1", "=1"])
-def test_what_is_no_limit_is_reported_in_one_line(text: str) -> None:
-    with pytest.raises(LimitError) as refused:
-        Limit.parse(text)
-    assert len(str(refused.value).splitlines()) == 1

@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.review.report import Check, Findings, Spread
-from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import read
 from aeroloop.service.terminal.log_tables import sparkline
 from tests.service.review.conftest import TICKS
@@ -226,6 +226,13 @@ def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.C
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"][0]["holds"] is False
     assert output.err == "aeroloop: latency.p50 ≤ 1 µs does not hold: 300 µs\n"
+
+
+@pytest.mark.parametrize("text", ["", "z_track", "z_track=", "z_track=x", "speed=1", "=1"])
+def test_what_is_no_limit_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(LimitError) as refused:
+        Limit.parse(text)
+    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from math import radians
@@ -23,7 +22,6 @@ from aeroloop.service.review.report import Check, Findings, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
-from aeroloop.service.terminal.log_tables import review_account
 from aeroloop.service.theorem import any_law
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
@@ -150,19 +148,13 @@ def test_an_error_larger_than_the_certificate_assumes_is_not_judged(tmp_path: Pa
     assert findings.reasons["theorem.broken"] == "no true state satisfies the lemma's premises"
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda one: None if one.topic == "truth" else one,
-        lambda one: truth_with(one, session=None, session_tick=None),
-        lambda one: truth_with(one, session="another"),
-    ],
-    ids=["none", "outside of sessions", "of another session"],
-)
+@pytest.mark.parametrize("session", [None, "another"])
 def test_without_a_true_state_of_a_tick_nothing_is_judged_and_the_reason_is_reported(
-    logs: Logs, tmp_path: Path, change: Callable[[Said], Said | None]
+    logs: Logs, tmp_path: Path, session: str | None
 ) -> None:
-    findings, theorem = judged(rewrite(logs("certified"), tmp_path / "a.mcap", change))
+    findings, theorem = judged(
+        rewrite(logs("certified"), tmp_path / "a.mcap", lambda one: truth_with(one, session=session))
+    )
     assert (theorem.samples, theorem.broken, theorem.pointwise_share, theorem.held) == (0, None, None, None)
     for name in ("broken", "pointwise_share", "held"):
         assert findings.reasons[f"theorem.{name}"] == "the log has no true state of a tick that is judged"
@@ -312,22 +304,3 @@ def test_the_true_line_goes_from_one_published_state_to_the_next_and_begins_with
     norm = lines_of(settings, ticks, found)["z_norm", "true"]
     assert np.isnan(norm[:10]).all()
     assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
-
-
-def test_the_bound_is_drawn_until_gains_or_reference_change() -> None:
-    settings, ticks = load(overrides=["reference.kind=hold"]), at_rest(range(0, 20_000, 100))
-    changes = [FIRST, change(16_000, gains=Gains(), reference=Hold())]
-    found = check_theorem(settings, ticks, truths_at(), changes, held(settings, plant_radius=0.5))
-    bound = lines_of(settings, ticks, found)["z_norm", "bound, once within it"]
-    np.testing.assert_array_equal(bound, np.where(ticks.k < 16_000, 0.5, np.nan))
-
-
-def test_the_account_says_what_held_and_in_one_line_what_could_not_be_judged(
-    logs: Logs, capfd: pytest.CaptureFixture[str]
-) -> None:
-    review_account(read(logs("ideal")).findings)
-    said = " ".join(capfd.readouterr().out.split())
-    assert "The certificate does not hold" in said
-    assert "The run kept to Lemma 1." in said
-    assert "Not judged: the bound at every instant, since the certificate does not hold." in said
-    assert re.search(r"600 true states belong to a tick\. At \d\d .*Lemma 1 is judged by the other 5\d\d\.", said)
