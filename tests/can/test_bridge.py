@@ -62,7 +62,6 @@ class Ends:
         assert alive.wait(PATIENCE_S)
 
     def close(self) -> None:
-        """End the bridge, and leave."""
         self._over.set()
         self.role.stop.set()
         for thread in self._threads:
@@ -71,24 +70,20 @@ class Ends:
         self.node.close()
 
     def say(self, state: PlantState, cause: TripCause | None = None, mark: bytes = OURS) -> None:
-        """Let the node say this, at once and from now on."""
         self._says = Heartbeat(state, cause.number if cause else 0, mark)
         self.node.beat(self._says)
 
     def fall_silent(self) -> None:
-        """Let the node say nothing more."""
         self._over.set()
         self._threads[1].join()
 
     def hold(self) -> None:
-        """Have the plant, and let the node say so."""
         eventually("the grant", lambda: isinstance(self.asker.claim(), Grant))
         eventually("granted on the bus", lambda: self.received_state() is PlantState.GRANTED)
         self.say(PlantState.GRANTED)
         time.sleep(0.15)  # what a node says in the first 0.1 s may be of before the session
 
     def release(self) -> bool:
-        """Give the plant back."""
         return self.asker.ask("release", Release(session=self.asker.session)).done
 
     def received_state(self) -> PlantState | None:
@@ -106,7 +101,6 @@ class Ends:
         self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
 
     def command(self, echo: int) -> None:
-        """Answer a measurement."""
         key = topics.key("command", "aero", session=self.asker.session)
         self._session.put(key, WIRE.command.pack(echo, (3, -3)))
 
@@ -122,7 +116,6 @@ class Ends:
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """Both ends of a bridge."""
     with Gathering() as gathering:
         ends = Ends(gathering)
         try:

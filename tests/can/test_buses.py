@@ -112,7 +112,6 @@ class BusMonitor(can.Listener):
         self._bus.shutdown()
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Keep it."""
         self.received.append(Said(msg.timestamp, msg.arbitration_id, bytes(msg.data)))
 
     def last_command(self) -> float:

@@ -19,7 +19,6 @@ UNSENT = 20
 
 @pytest.fixture
 def flawed(flaws: Flaws) -> Iterator[tuple[CanLink, CanSettings]]:
-    """A plant's link on such a bus."""
     del flaws
     bus = virtual()
     link = CanLink(bus, PAPER, "plant")
@@ -28,7 +27,6 @@ def flawed(flaws: Flaws) -> Iterator[tuple[CanLink, CanSettings]]:
 
 
 def fill(flaws: Flaws, link: CanLink, frames: int) -> None:
-    """Frames that the bus does not take."""
     flaws.full = True
     for _ in range(frames):
         link.send(bytes(7))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from math import isinf
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
@@ -79,21 +78,6 @@ def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specifica
             assert next_heartbeat(link)[:3] == (PlantState.IDLE, 0, MARK)
 
 
-def test_the_newest_frame_wins_and_is_given_once() -> None:
-    with both_ends(virtual()) as (plant, controller, stranger):
-        before = time.monotonic_ns()
-        for k in range(5):
-            plant.send(bytes([k << 4, *range(6)]))
-        stranger.settle(controller)
-        assert controller.pending
-        arrival = controller.take()
-        assert arrival is not None
-        assert arrival.frame == bytes([4 << 4, *range(6)])
-        assert before <= arrival.at_ns <= time.monotonic_ns()
-        assert not controller.pending
-        assert controller.take() is None
-
-
 @pytest.mark.parametrize(("wire", "fd", "measurement", "command"), LENGTHS)
 def test_a_frame_of_a_wrong_length_or_with_a_pad_that_is_not_zero_is_refused_and_counted(
     wire: WireSpec, fd: bool, measurement: tuple[int, int], command: tuple[int, int]
@@ -159,20 +143,6 @@ def next_heartbeat(link: CanLink) -> Heartbeat:
     received, link.peer = link.peer, None
     assert received is not None
     return received
-
-
-@pytest.mark.parametrize("state", PlantState)
-def test_a_heartbeat_carries_the_state_and_a_plants_every_cause_or_the_number_of_the_session(state: PlantState) -> None:
-    with both_ends(virtual()) as (plant, controller, _):
-        for number in range(16):
-            controller.beat(Heartbeat(state, number, MARK))
-            assert next_heartbeat(plant)[:3] == (state, number, MARK)
-        for cause in (None, *TripCause):
-            plant.beat(Heartbeat(state, cause.number if cause else 0, MARK))
-            received = next_heartbeat(controller)
-            assert (received.state, received.cause, received.fingerprint) == (state, cause, MARK)
-            assert 0 < received.at_ns <= time.monotonic_ns()
-            assert 0 <= controller.silent_s() < PATIENCE_S
 
 
 def test_a_malformed_heartbeat_is_refused_and_the_last_one_stands() -> None:

@@ -19,7 +19,6 @@ SLACK_S = 0.3
 
 @pytest.fixture
 def hasty_bus() -> Iterator[Bus]:
-    """A node on a bus."""
     bus = Bus(virtual())
     yield bus
     bus.close()

@@ -19,8 +19,8 @@ from aeroloop.protocol.messages.trace import End
 from aeroloop.service.config import load
 from aeroloop.service.testing.hil import HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
-from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, RATE, Statuses, assert_whole
+from tests.support.zenoh_network import eventually
 
 LIBRARIES = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
 
@@ -52,7 +52,6 @@ time.sleep = lambda seconds: sleep(seconds / rate)
 
 
 def python_clocks(tmp_path: Path, **environment: str) -> dict[str, str]:
-    """The environment of a process with these clocks."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(CLOCKS)
     return {"PYTHONPATH": str(tmp_path / "site"), **environment}
@@ -119,7 +118,6 @@ def test_clocks_that_step_by_an_hour_in_mid_run_change_nothing(tmp_path: Path) -
 
 
 def assert_stepped(tmp_path: Path, end: End) -> None:
-    """Without a step nothing is shown."""
     walls = [batch.header.wall_ns for batch in HilLog(tmp_path / "a.mcap").batches(end)]
     assert max(walls) - min(walls) > 0.9 * STEP_S * 1e9
 

@@ -29,7 +29,7 @@ later. A daemon that starts takes 1 to 3 s."""
 
 def cables_loss_and_a_narrow_link(hosts: Deployment) -> None:
     hosts.cut_off_each()
-    hosts.lossy(20, "both", 2.0)
+    hosts.lossy(20, "both", 6.0)  # with `network.transport=tcp` the loop stands for longer than the watchdog
     hosts.slow(256, 2.0)
     hosts.lossy(1, "both", 2.0)
 
@@ -40,8 +40,8 @@ def cables_and_a_new_router(hosts: Deployment) -> None:
 
 
 def assert_cheap(outcome: Outcome) -> None:
-    """Only what the loop's frames pass may cost a trip; then 0 V in time, and the plant is driven again."""
-    if any(party in outcome.title for party in ("recorder", "operator", "1 % lost")):
+    """Lost datagrams and third parties cost no trip; what cuts the frames off does: 0 V in time, and driven again."""
+    if any(party in outcome.title for party in ("recorder", "operator", "% lost")):
         assert outcome.trips == 0, outcome
     elif "cable" in outcome.title or "ended" in outcome.title:
         assert outcome.rest_s is not None, outcome

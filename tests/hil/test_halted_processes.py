@@ -83,7 +83,6 @@ def test_a_process_that_hangs_or_dies_keeps_no_operator_and_no_newcomer_out(tmp_
 
 
 def send_until_armed(settings: Settings) -> None:
-    """Arm the plant, unless it is driven already."""
 
     def armed() -> bool:
         try:

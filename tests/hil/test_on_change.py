@@ -5,7 +5,6 @@ Most tests share one run in real time of a body at rest that an operator turns a
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,14 +13,12 @@ from typing import NamedTuple
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.service.cli.main import execute
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.hil_log import RunFigures
 from tests.hil.test_faults import FAST_TRUTH, PATIENT, SLACK_S, WATCHDOG_S, last_command_ns, seconds_driven_after
 from tests.hil.test_operate import done
-from tests.hil.test_processes import FIGURES, aeroloop
+from tests.hil.test_processes import aeroloop
 
 ON_CHANGE = {"wire.transmit": "on_change"}
 RATE = 500
@@ -53,24 +50,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 def assert_replays(log: Path, at_least: int) -> None:
-    """Both ends replay byte for byte."""
     replayed = replay([log])
     for end in (replayed.controller, replayed.plant):
         assert end is not None, replayed.reasons
         assert end.differ == 0
         assert end.ticks >= at_least
-
-
-def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit(tmp_path: Path) -> None:
-    cell = ("--duration", "2", "--set", "wire.transmit=on_change")
-    log = tmp_path / "a.mcap"
-    demo = aeroloop("demo", "--lockstep", "--log", str(log), *cell)
-    experiment = aeroloop("lab", "experiment", *cell)
-    assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
-    assert (demo["skipped_ticks"], demo["trips"]) == (0, [])
-    assert demo["measurement"]["frames_per_s"] < RATE
-    assert demo["command"]["frames_per_s"] < RATE
-    assert_replays(log, 2 * RATE)
 
 
 def test_in_lockstep_frames_that_are_lost_or_late_end_no_session_and_the_log_is_computed_again(tmp_path: Path) -> None:
@@ -106,26 +90,6 @@ def test_status_counts_the_frames_and_the_ticks_apart(run: Run) -> None:
     assert run.controller.rate_hz > 0.5 * RATE
     assert run.plant.received <= run.controller.sent + RATE  # reported up to a second apart
     assert run.plant.refused == run.controller.refused == 0
-
-
-def test_an_export_has_a_row_a_tick(run: Run, tmp_path: Path) -> None:
-    out = tmp_path / "a.csv"
-    assert execute(["log", "export", str(run.log.path), "--to", "csv", "--out", str(out)]) == 0
-    with out.open(newline="") as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    ticks = [int(row["tick"]) for row in rows]
-    assert ticks == sorted(set(ticks))
-    assert ticks == read(run.log.path).ticks.k.tolist()
-    assert len(ticks) > 0.5 * RATE * run.figures.duration_s
-
-
-def test_what_is_whole_of_a_log_that_was_cut_is_still_computed_again(run: Run, tmp_path: Path) -> None:
-    cut, out = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
-    content = run.log.path.read_bytes()
-    cut.write_bytes(content[: len(content) * 6 // 10])
-    assert execute(["log", "recover", str(cut), str(out)]) == 0
-    assert_replays(out, 1)
-    assert 0.2 < review(out).duration_s < run.figures.duration_s
 
 
 def moments(log: HilLog, kind: str) -> list[int]:

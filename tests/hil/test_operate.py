@@ -27,7 +27,6 @@ AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 
 
 def op(hil: Hil, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """An operator's command on the loop's network."""
     network = ["--set", f"network.rendezvous={hil.settings.network.rendezvous}"]
     return subprocess.run(
         [*AEROLOOP, "op", *arguments, *network], capture_output=True, text=True, timeout=60, check=False

@@ -22,5 +22,4 @@ def fake_package() -> Iterator[None]:
 
 @pytest.fixture
 def hil_plant() -> str:
-    """The board."""
     return "quanser"

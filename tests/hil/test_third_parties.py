@@ -44,12 +44,10 @@ def hosts(tmp_path: Path) -> Iterator[Hosts]:
 
 
 def seen(folder: Path) -> list[dict[str, object]]:
-    """Statuses and events so far."""
     return [json.loads(line) for line in (folder / "seen").read_text().splitlines() if line.endswith("}")]
 
 
 def ticks(folder: Path) -> list[int]:
-    """Ticks in the plant's statuses of a session."""
     return [int(str(line["ticks"])) for line in seen(folder) if line.get("state") == "driven"]
 
 

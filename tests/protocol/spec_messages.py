@@ -48,7 +48,6 @@ def _default(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
 
 
 def _type(shape: dict[str, Any]) -> str:
-    """A JSON type in words."""
     if "$ref" in shape:
         return str(shape["$ref"]).rpartition("/")[2]
     if options := shape.get("anyOf", shape.get("oneOf")):

@@ -88,7 +88,6 @@ def form(frame: str, counter_bits: str, bits: str, actuators: str) -> FrameForma
 
 
 def as_bits(text: str) -> int | str:
-    """A width as a person writes it."""
     return text if text == "cont" else int(text)
 
 
@@ -192,7 +191,6 @@ def longest(topic: Topic) -> int:
 
 
 def size(count: int) -> str:
-    """A number of bytes as the text has it."""
     for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if count % factor == 0:
             return f"{count // factor} {unit}"

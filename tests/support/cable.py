@@ -10,14 +10,7 @@ from typing import Self
 
 
 class Cable:
-    """Relays TCP connections to one port, as long as it is whole.
-
-    Args:
-        port: Where the far end listens, on loopback.
-
-    Attributes:
-        endpoint: Where the near end connects, as a Zenoh endpoint.
-    """
+    """Relays TCP connections from `endpoint` to a port of loopback, as long as it is whole."""
 
     def __init__(self, port: int) -> None:
         self._port = port

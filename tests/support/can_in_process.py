@@ -31,11 +31,7 @@ def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> C
 
 
 class Stranger:
-    """One more on the bus: sees every frame as it is, and says whatever a test wants. A context.
-
-    Args:
-        settings: The bus.
-    """
+    """One more on the bus: sees every frame as it is, and says whatever a test wants. A context."""
 
     def __init__(self, settings: CanSettings) -> None:
         self._node = settings.node
@@ -79,7 +75,6 @@ class Stranger:
         return beat
 
     def everything(self) -> list[can.Message]:
-        """What has come and was not yet received."""
         return list(iter(lambda: self._bus.recv(0), None))
 
     def settle(self, *links: CanLink) -> None:
@@ -92,16 +87,7 @@ class Stranger:
 
 
 class Flaws:
-    """What is wrong with every `FlawedBus`, now.
-
-    Attributes:
-        full: No frame is taken.
-        lost: Neither sending nor receiving works.
-        gone: It cannot be opened.
-        opened: How often somebody tried to open one.
-        closed: How often somebody closed one.
-        sent: Frames that one was asked to take.
-    """
+    """What is wrong with every `FlawedBus` now: it takes no frame, is lost, cannot be opened; what was tried."""
 
     def __init__(self) -> None:
         self.full = self.lost = self.gone = False
@@ -123,7 +109,6 @@ class FlawedBus(VirtualBus):
         super().__init__(channel, **options)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send, unless it is full or lost."""
         self._flaws.sent += 1
         if self._flaws.lost:
             raise OSError("no such device")
@@ -132,7 +117,6 @@ class FlawedBus(VirtualBus):
         super().send(msg, timeout)
 
     def shutdown(self) -> None:
-        """Close it."""
         self._flaws.closed += 1
         super().shutdown()
 

@@ -22,7 +22,6 @@ OURS = fingerprint(WIRE, PERIOD_NS, lockstep=False)
 
 
 def measurement(counter: int, codes: Sequence[int] = (1, -2, 3, -4, 5, -6)) -> bytes:
-    """A well-formed measurement frame."""
     return WIRE.measurement.pack(counter % COUNTERS, codes)
 
 
@@ -42,7 +41,6 @@ class Bus:
         self.front.serve()
 
     def close(self) -> None:
-        """Leave."""
         self.front.leave()
         self.side.close()
         self.stranger.__exit__(None, None, None)
@@ -52,7 +50,6 @@ class Bus:
         self.say, self.said_at = Heartbeat(state, number, mark), 0.0
 
     def turn(self) -> None:
-        """One tick of the node, as its driver makes it."""
         if self.say is not None and time.monotonic() >= self.said_at + 0.1:
             self.said_at = time.monotonic()
             self.side.beat(self.say)
@@ -66,14 +63,12 @@ class Bus:
         time.sleep(0.001)
 
     def until(self, what: str, condition: Callable[[], bool]) -> None:
-        """Turn until something is so."""
         deadline = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < deadline, f"{what} did not happen within {PATIENCE_S:g} s"
             self.turn()
 
     def turn_for(self, seconds: float) -> None:
-        """Turn for so long."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             self.turn()
@@ -84,12 +79,10 @@ class Bus:
         self.until(f"heartbeat {wanted}", lambda: self.side.peer is not None and self.side.peer[:3] == wanted)
 
     def begin(self, number: int = 1) -> None:
-        """Turn until a session has begun."""
         self.send_heartbeat(PlantState.GRANTED, number)
         self.until("the session", lambda: self.endpoint.session == f"can-{number}")
 
     def drive(self, code: int = 5) -> None:
-        """Answer measurements until the node is driven."""
 
         def driven() -> bool:
             arrival = self.side.take()

@@ -23,11 +23,7 @@ def common_name(role: str, vehicle: str | None) -> str:
 
 
 class Authority:
-    """A private authority, whose `ca.pem` and certificates stand in one folder, as a host has them.
-
-    Attributes:
-        folder: The folder, for `network.security.directory`.
-    """
+    """A private authority, whose `ca.pem` and certificates stand in one `folder`, as a host has them."""
 
     def __init__(self, folder: Path, days: float = 10.0) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -57,14 +53,8 @@ class Authority:
     ) -> Path:
         """Issue a certificate with a key of its own and return its file, `ROLE.VEHICLE.pem`, beside which the key is.
 
-        Args:
-            role: Its role, of any spelling.
-            vehicle: Its vehicle; None is every vehicle.
-            file: Stem of its file, where that is not the one of its role and vehicle: a certificate under a wrong name.
-            folder: Its folder, where that is not the authority's: a foreign certificate among others.
-            begins: Begin of its validity from now on; after now: not yet valid.
-            ends: End of its validity; before now: expired.
-            cn: Its common name, where that is not the one of its role and vehicle.
+        `file` is another stem for it, for a certificate under a wrong name; `folder` another folder, for a foreign one
+        among others; `begins` and `ends` bound its validity from now on; `cn` is a common name of another role or none.
         """
         key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
         subject = [

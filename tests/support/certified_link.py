@@ -78,7 +78,6 @@ class Pair(NamedTuple):
     hand: zenoh.Session
 
     def settle(self) -> None:
-        """Wait until all that either has sent has arrived."""
         for asking in (self.hand, self.guard):
             assert any(reply.ok for reply in asking.get(MARKER, timeout=PATIENCE_S, allowed_destination=_BY))
 

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 
 class FakeClock:
-    """A clock that moves only when `now_ns` is set, by `advance`, or by a sleep.
-
-    Attributes:
-        now_ns: The time, monotonic and of the wall clock [ns].
-        oversleep_ns: By how much a sleep takes longer than asked for [ns].
-        slept: How long each sleep was to take [s].
-    """
+    """A clock that moves when `now_ns` is set, by `advance`, or by a sleep, which may take `oversleep_ns` longer."""
 
     def __init__(self, now_ns: int = 1_000_000_000_000) -> None:
         self.now_ns = now_ns

@@ -32,14 +32,7 @@ AWAY_S: Final = 2.0
 
 
 class Outcome(NamedTuple):
-    """What a trouble cost.
-
-    Attributes:
-        title: What was done.
-        trips: How often the plant tripped.
-        rest_s: From its begin to the first trip, when the motors are at 0 V [s]; None without one.
-        again_s: From its end until the plant is driven and stays so [s]; None without a trip.
-    """
+    """What a trouble cost: trips, seconds to 0 V from its begin, seconds from its end until the plant stays driven."""
 
     title: str
     trips: int
@@ -54,11 +47,7 @@ class Outcome(NamedTuple):
 
 
 class Deployment(Hosts):
-    """Hosts of an example configuration, with a certificate each.
-
-    Attributes:
-        daemons: By host, once started.
-    """
+    """Hosts of an example configuration with a certificate each; `daemons` by host, once started."""
 
     def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
         super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")
@@ -93,7 +82,6 @@ class Deployment(Hosts):
         self.await_driven(0.0)
 
     def start_daemon(self, host: str, environment: Mapping[str, str] | None = None) -> None:
-        """Start the daemon of a host."""
         words = {"plant": ["emulator"], "controller": ["controller", "--auto-arm"], "router": ["router"],
                  "recorder": ["recorder", "--log", str(self.log_file)]}[host]  # fmt: skip
         self.daemons[host] = self.aeroloop(host, *words, overrides=self._overrides, environment=environment)
@@ -109,19 +97,16 @@ class Deployment(Hosts):
         self.await_driven(time.time() + 0.5)  # by a later status: that one may have been under way
 
     def cut_off(self, host: str, for_s: float = AWAY_S) -> None:
-        """Pull a host's cable, and put it back."""
         self.suffer(
             f"cable of the {host} out for {for_s:g} s", partial(self.pull, host), partial(self.plug, host), for_s
         )
 
     def cut_off_each(self) -> None:
-        """Pull the cable of each host in turn."""
         for host in HOSTS:
             if host in self.daemons or host == "operator":
                 self.cut_off(host)
 
     def lossy(self, percent: float, ways: Ways, for_s: float) -> None:
-        """Lose a share of the plant's packets for a time."""
         what = {"both": "sends and receives", "sent": "sends", "received": "receives"}[ways]
         title = f"{percent:g} % lost of what the plant {what}"
         self.suffer(title, partial(self.lose, "plant", percent, ways), partial(self.lose, "plant", 0), for_s)
@@ -132,7 +117,6 @@ class Deployment(Hosts):
         self.suffer(title, partial(self.narrow, "plant", kbit_per_s, "both"), partial(self.plug, "plant"), for_s)
 
     def restart(self, host: str) -> None:
-        """End the daemon of a host, and start it again."""
 
         def end() -> None:
             self.daemons[host].send_signal(signal.SIGTERM)

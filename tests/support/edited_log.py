@@ -37,12 +37,10 @@ class Said(NamedTuple):
 
     @property
     def at_ns(self) -> int:
-        """When it was recorded."""
         return self.published_ns if self.recorded_ns is None else self.recorded_ns
 
     @property
     def topic(self) -> str:
-        """The name of its topic."""
         address = topics.read_key(self.key)
         return address.topic.name if address else ""
 
@@ -89,7 +87,6 @@ def rewrite(
 
 
 def write_messages(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
-    """Write messages in this order."""
     with out.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="aeroloop", library="test")

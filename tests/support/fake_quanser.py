@@ -53,7 +53,6 @@ class HILError(Exception):
     """The board refuses a call or fails."""
 
     def get_error_message(self) -> str:
-        """Message of the error."""
         return str(self.args[0])
 
 
@@ -91,23 +90,9 @@ class Task:
 class FakeQuanser:
     """A board with an emulated Aero on it, and the names of the module `quanser.hardware`.
 
-    Args:
-        settings: The Aero. Its joints have the card's encoders, and its IMU the gyro of `settings.sensors`.
-        period: Time between samples [s].
-        card_type: Type of the board, a key of BOARDS.
-        realtime: Whether samples fall due by the clock, or when they are read.
-
-    Attributes:
-        HIL: Makes a board's handle, as the class in the module does.
-        calls: Names of the last 10 000 calls.
-        time: Samples since the task was started.
-        analog: Voltages on the analog outputs [V].
-        enabled: 1 for each motor's amplifier that is on.
-        leds: Red, green, blue.
-        expired: Whether the watchdog has expired.
-        shorts: So many `task_read` return without a sample from now on.
-        reads_while_expired: Whether reads succeed after the watchdog has expired; the documentation is silent.
-        counts_overflows: Whether the board counts lost samples.
+    Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started. The
+    documentation is silent on whether reads succeed after the watchdog has expired (`reads_while_expired`), and not
+    every board counts lost samples (`counts_overflows`).
     """
 
     HILError = HILError
@@ -150,7 +135,6 @@ class FakeQuanser:
         return tuple(volts if on else 0.0 for volts, on in zip(self.analog, self.enabled, strict=True))
 
     def truth(self) -> State:
-        """The Aero's true state."""
         return self._plant.truth()
 
     def fail_next(self, call: str, n: int = 1) -> None:
@@ -167,18 +151,15 @@ class FakeQuanser:
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
-        """Let periods pass without a read."""
         for _ in range(periods):
             self.step()
 
     def set_counts(self, channel: int, count: int) -> None:
-        """Set an encoder's present count."""
         self._zeros[channel] = self._raw[channel] - count
 
     # ── the board ──
 
     def step(self) -> None:
-        """Let one period pass."""
         task = self.task
         if task is None or not task.running:
             raise MisuseError("no task runs, so there is no sample to wait for")
@@ -201,7 +182,6 @@ class FakeQuanser:
             self.step()
 
     def sample(self, encoders: Sequence[int], other: Sequence[int]) -> tuple[list[int], list[float]]:
-        """Present values of these channels."""
         counts = [self._raw[channel] - self._zeros[channel] for channel in encoders]
         gyro = self._plant.measure().rate
         return counts, [gyro[channel - 3000] if channel in range(3000, 3003) else 0.0 for channel in other]
@@ -219,12 +199,10 @@ class FakeQuanser:
             raise HILError(f"{name} was made to fail")
 
     def restore(self, outputs: dict[Kind, list[Any]]) -> None:
-        """Set outputs by their kind."""
         for kind, values in outputs.items():
             self.outputs[kind][:] = values
 
     def _check_watchdog(self) -> None:
-        """Let the watchdog expire if its time is over."""
         if self.watchdog is not None and not self.expired and self.time - self.reloaded >= self.watchdog:
             self.expired = True
             self.before_expiry = {kind: list(values) for kind, values in self.outputs.items()}
@@ -457,7 +435,6 @@ def _check_task(task: object) -> None:
 
 
 def _numbers(channels: Any, n: int, there: Sequence[int]) -> list[int]:
-    """Channel numbers, from an array that C can read."""
     if channels is None and n == 0:
         return []
     _require(type(n) is int and n >= 1, f"a number of channels is an int of 1 or more, not {n!r}")

@@ -39,7 +39,6 @@ def faulty(
 
 
 def sensed(*faults: str, ticks: int = 8, seed: int = 0) -> list[Measurement]:
-    """What is measured at 0 s, 0.1 s, 0.2 s and so on."""
     plant, _ = faulty(*faults, seed=seed)
     seen = [plant.measure()]
     for _ in range(ticks):
@@ -68,10 +67,8 @@ def passed(*faults: str, frames: Sequence[bytes | None], seed: int = 0, period: 
 
 
 def numbered(count: int) -> list[bytes]:
-    """Frames that are their own index."""
     return [k.to_bytes(4, "big") for k in range(count)]
 
 
 def missing(values: Sequence[float]) -> bool:
-    """Whether there is no valid value."""
     return all(isnan(value) for value in values)

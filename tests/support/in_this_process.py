@@ -17,7 +17,6 @@ class InThisProcess(Executor):
     """Runs what is submitted at once."""
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """As of an executor."""
         future: Future[Any] = Future()
         try:
             future.set_result(work(*arguments))
@@ -32,7 +31,6 @@ def workers_here(count: int = 1, most: int = 1) -> Workers:
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every study run in this process."""
 
     @contextmanager
     def here(engine: str = sweep.PROCESSES) -> Iterator[Workers]:

@@ -51,7 +51,6 @@ def parts(data: bytes, at: int = 0) -> list[Part]:
 
 
 def chunks(data: bytes) -> list[Part]:
-    """The chunks of a whole file."""
     return [part for part in parts(data[: -len(MAGIC)], len(MAGIC)) if part.opcode == Opcode.CHUNK]
 
 

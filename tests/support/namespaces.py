@@ -45,11 +45,7 @@ Ways = Literal["sent", "received", "both"]
 
 
 class Hosts:
-    """Hosts by name, each with an address and a cable. A context: leaving it ends their processes and removes them.
-
-    Attributes:
-        rendezvous: Zenoh endpoints, one for each host, for `network.rendezvous`.
-    """
+    """Hosts by name, each with an address and a cable. A context: leaving it ends their processes and removes them."""
 
     def __init__(self, names: Sequence[str], folder: Path, config: Path | None = None) -> None:
         self._folder = folder
@@ -137,22 +133,18 @@ class Hosts:
         return configured or NetworkSettings(rendezvous=self.rendezvous, insecure=True)
 
     def log(self, host: str) -> Path:
-        """What processes on a host logged."""
         return self._folder / f"{host}.log"
 
     def plug(self, host: str) -> None:
-        """Plug a host's cable in, at full speed."""
         for where, device in self._ends(host):
             with suppress(NoNamespacesError):
                 _ip("netns", "exec", where, "tc", "qdisc", "del", "dev", device, "root")
         _ip("-n", self._switch, "link", "set", host, "up")
 
     def pull(self, host: str) -> None:
-        """Pull a host's cable out."""
         _ip("-n", self._switch, "link", "set", host, "down")
 
     def narrow(self, host: str, kbit_per_s: int, ways: Ways = "received") -> None:
-        """Limit what a host receives, sends, or both."""
         for way, (where, device) in zip(("received", "sent"), self._ends(host), strict=True):
             if ways in (way, "both"):
                 rate = ("tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")

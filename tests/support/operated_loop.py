@@ -110,14 +110,7 @@ class LonelyNode(Node):
 
 
 class Loop:
-    """What the daemon does around OperatorChanges, with a log of what a recorder would have kept.
-
-    Attributes:
-        clock: The fake clock of the node.
-        k: The next tick.
-        session: Name of the session, or "".
-        log: Of each session, its frames: (tick, measurement, command).
-    """
+    """What the daemon does around OperatorChanges; `log` has each session's ticks, measurements and commands."""
 
     def __init__(
         self,
@@ -183,7 +176,6 @@ class Loop:
         return query
 
     def answered(self, topic: str, message: Message | bytes) -> Answer:
-        """The answer to a question, by the next tick."""
         query = self.ask(topic, message)
         self.tick()
         (answer,) = query.answers
@@ -194,22 +186,18 @@ class Loop:
         self.raw(Setpoint(attitude=(roll, pitch, yaw)).encode())
 
     def raw(self, payload: bytes) -> None:
-        """Bytes come where set-points should."""
         self.network.received[topics.key("reference", "aero")].append(SimpleNamespace(payload=_bytes(payload)))
 
     # What was published
 
     def published(self, topic: str, model: type[M]) -> list[M]:
-        """Every message on a topic."""
         key = topics.key(topic, "aero", role="controller")
         return [model.model_validate_json(payload) for at, payload in self.network.put if at == key]
 
     def changes(self) -> list[Change]:
-        """Every change of this session, as a log has it."""
         return [change for change in self.trace.changes if change.session == self.session]
 
     def events(self, kind: str) -> list[str]:
-        """The texts of a kind that were published."""
         return [event.text for event in self.published("event", Event) if event.kind == kind]
 
     def yaw(self) -> float:
@@ -231,5 +219,4 @@ class Loop:
 
 
 def gains_with(**changed: tuple[float, float, float]) -> Gains:
-    """The configured gains with these changed."""
     return Gains.model_validate({"C1": LAW.C1, "C2": LAW.C2, "Gamma": LAW.Gamma, **changed})

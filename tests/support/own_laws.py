@@ -81,7 +81,6 @@ class Node:
 
 
 def cycle() -> Node:
-    """A node of a cycle of two."""
     node, node.other = (pair := Node()), Node()
     node.other.other = pair
     return node

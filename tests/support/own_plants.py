@@ -24,13 +24,15 @@ class TurntableSettings(BaseModel, extra="forbid"):
 
 
 class Turntable(Plant):
-    """Turns about z by the mean of its voltages."""
+    """Turns about z by the mean of its voltages; `latest` is the one made last."""
 
     Settings = TurntableSettings
     repeatable: ClassVar[bool] = True
+    latest: ClassVar[Turntable]
     actuators = 1
 
     def __init__(self, settings: TurntableSettings, period: float) -> None:
+        Turntable.latest = self
         self._own, self._period = settings, period
         self._angle = self._rate = 0.0
         self._ticks = 0

@@ -103,11 +103,9 @@ class Asker:
 
     @property
     def session(self) -> str:
-        """Name of the last claim's session."""
         return f"of-a-{self._claims}"
 
     def query(self, topic: str, payload: bytes = b"") -> bytes:
-        """The first answer to a query of a topic."""
         answers: list[bytes] = []
 
         def answered() -> bool:
@@ -130,7 +128,6 @@ class Asker:
         return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
 
     def refusal(self, *, auto_arm: bool = True) -> str:
-        """Why a claim is refused."""
         refused = self.claim(auto_arm=auto_arm)
         assert isinstance(refused, Refusal)
         return refused.reason

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Self
 from unittest.mock import patch
 
@@ -35,7 +35,6 @@ class Wires(Link):
         self._due: list[tuple[int, bytes]] = []
 
     def deliver(self, frame: bytes, tick: int) -> None:
-        """Let a frame be there from a tick on."""
         self._due.append((tick, frame))
 
     def send(self, frame: bytes) -> None:
@@ -43,7 +42,6 @@ class Wires(Link):
 
     @property
     def pending(self) -> bool:
-        """Whether a frame is due."""
         return any(tick <= self.tick for tick, _ in self._due)
 
     def take(self) -> Arrival | None:
@@ -58,7 +56,6 @@ class Wires(Link):
         return self.take()
 
     def close(self) -> None:
-        """Forget what is on its way."""
         self._due.clear()
 
 
@@ -73,7 +70,6 @@ class Grid:
         self._skip = skip
 
     def wait(self) -> int:
-        """The next tick, after those that are skipped."""
         skipped = self._skip()
         self.skipped += skipped
         self.tick += 1 + skipped
@@ -81,21 +77,10 @@ class Grid:
 
 
 class Stage(PlantNetwork):
-    """Runs an emulator's driver to a tick.
+    """Runs a driver, an emulator's unless given, to a tick.
 
-    Args:
-        loop: The grid.
-        wire: What the frames are.
-        plant: The emulator.
-        between: Called between ticks.
-        answer: Called with every measurement that is sent; UNCHANGED in lockstep only.
-        skip: Ticks to skip before the next.
-        driver: Instead of an emulator.
-
-    Attributes:
-        batches: What was published.
-        driver: The driver; an Emulator unless one was given.
-        link: The wires, while a session runs.
+    `between` is called between ticks, `answer` with every measurement that is sent (UNCHANGED in lockstep only), and
+    `skip` gives the ticks to skip before the next. `sent` are the measurements, `wires` the way of the commands.
     """
 
     def __init__(
@@ -123,7 +108,6 @@ class Stage(PlantNetwork):
         self._ends = 0
 
     def run(self, ticks: int) -> Self:
-        """Run so many ticks of the plant, and leave."""
         self._ends = ticks
         with (
             patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda *_, **__: Grid(self._skip)),
@@ -135,7 +119,6 @@ class Stage(PlantNetwork):
 
     @property
     def batches(self) -> list[Batch]:
-        """What was published."""
         batches = [read_batch(payload) for payload in self._published]
         assert None not in batches
         return [batch for batch in batches if batch is not None]
@@ -154,6 +137,12 @@ class Stage(PlantNetwork):
             )
         )
 
+    def command(self, measurement: bytes, codes: Sequence[float]) -> None:
+        """Answer a measurement at once."""
+        counter = self.wire.measurement.counter(measurement)
+        assert counter is not None
+        self.wires.deliver(self.wire.command.pack(counter, codes), self.endpoint.ticked)
+
     @property
     def link(self) -> Link | None:
         """The session's frames; None while there is no session."""
@@ -163,18 +152,15 @@ class Stage(PlantNetwork):
         """Nothing to declare."""
 
     def take_inbox(self) -> None:
-        """What the test says."""
         self._between(self)
         self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Have it answered, at once or later."""
         if frame != UNCHANGED or self.loop.lockstep:
             self.sent.append(frame)
             self._answer(self, frame)
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """As a ZenohNetwork does."""
         self.trace.row(self.endpoint, measurement, arrival, sent_ns)
         self.wires.tick = self.endpoint.ticked
         self.follow_session()
@@ -182,12 +168,10 @@ class Stage(PlantNetwork):
             self.stop.set()
 
     def follow_session(self) -> None:
-        """As a ZenohNetwork does."""
         self.trace.follow(self.endpoint)
         if self.endpoint.session is None:
             self.wires.close()
 
     def leave(self) -> None:
-        """As a ZenohNetwork does."""
         self.follow_session()
         self.trace.finish()

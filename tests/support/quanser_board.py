@@ -53,7 +53,6 @@ def plant_of(board: FakeQuanser, settings: QuanserSettings = AERO.quanser) -> Qu
 
 
 def drive(plant: Plant, periods: int, voltages: tuple[float, float] = VOLTS) -> None:
-    """Command the voltages in each of these periods."""
     for _ in range(periods):
         plant.actuate(voltages)
         plant.advance()
@@ -83,7 +82,6 @@ def emulated_aero(settings: PlantSettings = AERO, counts: tuple[int, int] = (288
 
 
 def is_nothing(seen: Measurement) -> bool:
-    """Whether a measurement has no value at all."""
     return all(isnan(value) for value in (*seen.attitude, *seen.rate))
 
 
@@ -94,20 +92,4 @@ class Calls:
         self._board, self._before = board, len(board.calls)
 
     def names(self) -> list[str]:
-        """The names, in order."""
         return list(self._board.calls)[self._before :]
-
-
-class HandClock:
-    """Takes the place of the module `time`; sleeping takes no time but its own."""
-
-    def __init__(self) -> None:
-        self.ns = 10**9
-        self.slept: list[float] = []
-
-    def monotonic_ns(self) -> int:
-        return self.ns
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.ns += round(seconds * 1e9)

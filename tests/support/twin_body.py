@@ -9,7 +9,6 @@ from tests.support.numpy_twin import Body
 
 
 def body_of(p: AdaptiveSettings) -> Body:
-    """The body and the gains that a law believes in."""
     return Body(
         J=np.diag(p.inertia),
         m=p.mass,

@@ -12,7 +12,6 @@ COUNTER_BITS = range(4, 17)
 def wire_of(
     attitude: int | None, rate: int | None, voltage: int | None, actuators: int = 2, counter_bits: int = 8
 ) -> WireSpec:
-    """A spec of these bits."""
     return WireSpec.model_validate(
         {
             "attitude": {"bits": attitude, "limit": 1.0},

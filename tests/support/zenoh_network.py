@@ -14,12 +14,11 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
 """How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""
 
 
 def free_port() -> int:
-    """A port of this machine that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -33,11 +32,11 @@ def accepts(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def eventually(what: str, condition: Callable[[], bool]) -> None:
-    """Poll for what another thread brings about and announces by no event."""
-    deadline = time.monotonic() + PATIENCE_S
+def eventually(what: str, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> None:
+    """Poll for what another thread or process brings about and announces by no event."""
+    deadline = time.monotonic() + within_s
     while not condition():
-        assert time.monotonic() < deadline, f"{what} did not happen within {PATIENCE_S:g} s"
+        assert time.monotonic() < deadline, f"{what} did not happen within {within_s:g} s"
         time.sleep(0.005)
 
 

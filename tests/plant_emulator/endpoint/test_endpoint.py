@@ -179,7 +179,6 @@ def turned(degrees: float, axis: str = "y") -> Measurement:
 
 
 def driven(limits: LimitSettings) -> tuple[Endpoint, RecordingPlant]:
-    """An endpoint at tick 1, at full voltage."""
     plant = RecordingPlant()
     full = WIRE.voltage.quantizer().outermost
     endpoint = Endpoint(plant, WIRE, PERIOD_NS, limits=LimitMonitor(limits, PERIOD_NS, full))
@@ -251,7 +250,6 @@ GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 
 
 def record(name: str, yaw: float = 30.0) -> SessionRecord:
-    """What a controller hands over."""
     return SessionRecord(
         controller=name, session=f"of-{name}", gains=GAINS, gains_from="operator",
         reference=Hold(attitude=(0.0, 0.0, yaw)), reference_from="operator", within_s=2.0, since_tick=0,
@@ -259,7 +257,6 @@ def record(name: str, yaw: float = 30.0) -> SessionRecord:
 
 
 def last_granted(end: VehicleClaim, name: str) -> SessionRecord | None:
-    """The record that a claim is granted with."""
     answer = end.claim(claim_of(name))
     assert isinstance(answer, Grant)
     return answer.last
@@ -267,14 +264,12 @@ def last_granted(end: VehicleClaim, name: str) -> SessionRecord | None:
 
 @pytest.fixture(params=["endpoint", "bridge"])
 def end(request: pytest.FixtureRequest) -> VehicleClaim:
-    """Both ends that grant claims, armed."""
     if request.param == "endpoint":
         return Endpoint(RecordingPlant(), WIRE, PERIOD_NS, armed=True)
     return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
 
 
 def lost_and_stopped(end: VehicleClaim) -> None:
-    """A later stop replaces how it ended."""
     end.lost("a")
     end.stop()
 

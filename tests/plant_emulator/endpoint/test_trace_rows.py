@@ -10,6 +10,7 @@ import pytest
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -23,14 +24,10 @@ OFF = (0.0, 0.0)
 
 
 def answer(stage: Stage, measurement: bytes) -> None:
-    """At once, with the same voltages."""
-    counter = stage.wire.measurement.counter(measurement)
-    assert counter is not None
-    stage.wires.deliver(stage.wire.command.pack(counter, (3, -3)), stage.endpoint.ticked)
+    stage.command(measurement, (3, -3))
 
 
 def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:
-    """Do this after these ticks."""
 
     def between(stage: Stage) -> None:
         if act := what.pop(stage.endpoint.ticked, None):
@@ -40,7 +37,6 @@ def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:
 
 
 def rows(batches: list[Batch], column: str) -> list[object]:
-    """A column of all batches."""
     return [value for batch in batches for value in batch.columns[column].tolist()]
 
 
@@ -176,6 +172,13 @@ def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> N
     assert (seen[5], seen[6], seen[9], seen[10]) == (0, 1, 1, 2)
     assert [(batch.header.rows, batch.header.session, batch.header.final) for batch in batches] == [(0, "", False)] * 2
     assert [operation.kind for operation in operations(batches)] == ["stop", "arm"]
+
+
+def test_a_plant_that_is_not_armed_at_its_start_waits_for_an_operator() -> None:
+    stage = Stage(LOOP, WIRE, PLANT.model_copy(update={"armed_at_start": False}))
+    assert isinstance(stage.claim(auto_arm=False), Refusal)
+    assert stage.endpoint.arm()
+    assert isinstance(stage.claim(auto_arm=False), Grant)
 
 
 def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -18,9 +17,9 @@ from pydantic import ValidationError
 from aeroloop.plant_emulator.engines.fmu import FmuError, FmuPlant, FmuSettings, body_rate, quaternion_of
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.service.cli.main import execute
+from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.service.config import load, with_bits
-from aeroloop.service.lab.experiment import experiment
+from aeroloop.service.lab.experiment import experiment, run_experiment
 from tests.support.aero_fmu import IDEAL, PERIOD, altered, fmi2, fmi3, fmpy
 from tests.support.numpy_twin import rotation
 
@@ -193,7 +192,6 @@ BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]]
 
 
 def refusal(settings: FmuSettings) -> str:
-    """The line with which an FMU is refused."""
     with pytest.raises(FmuError) as refused:
         FmuPlant(settings, PERIOD)
     assert "\n" not in str(refused.value)
@@ -289,30 +287,11 @@ def test_settings_that_contradict_each_other_are_refused(changes: dict[str, Any]
 # ── behind the loop ──
 
 
-@pytest.fixture
-def configuration(fmus: dict[str, Path], tmp_path: Path) -> Callable[[str], Path]:
-    def write(mapping: str) -> Path:
-        names = "\n".join(f"{key} = {json.dumps(value)}" for key, value in BODY[mapping].items())
-        path = tmp_path / "fmu.toml"
-        path.write_text(
-            f'[plant]\nkind = "fmu"\n[plant.own]\nfile = "{fmus[mapping]}"\nvoltages = ["u2", "u3"]\n{names}\n'
-        )
-        return path
-
-    return write
-
-
-FIGURES = ("z_track", "u_total", "max_error_deg", "measurement", "command")
-
-
 @pytest.mark.parametrize("mapping", BODY)
-def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
-    configuration: Callable[[str], Path], mapping: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cell = ["lab", "experiment", "--json", "--duration", "4", "--bits", "cont"]
-    assert execute([*cell, "--config", str(configuration(mapping))]) == 0
-    theirs = json.loads(capsys.readouterr().out)
-    assert execute([*cell, "--set", "plant.ideal=true"]) == 0
-    ours = json.loads(capsys.readouterr().out)
-    for name in FIGURES[:3]:  # compiled or frame by frame: sums differ by some units in the last place
-        assert theirs[name] == pytest.approx(ours[name], rel=1e-9)
+def test_an_experiment_gives_the_figures_of_our_ideal_aero(fmus: dict[str, Path], mapping: str) -> None:
+    settings = with_bits(load(overrides=["plant.ideal=true"]), "cont")
+    own = {"file": str(fmus[mapping]), "voltages": VOLTAGES, **BODY[mapping]}
+    theirs = run_experiment(settings.model_copy(update={"plant": PlantSettings(kind="fmu", own=own)}), 4.0)
+    ours = run_experiment(settings, 4.0)
+    for name in ("z_track", "u_total", "max_error_deg"):  # compiled or frame by frame: sums differ in the last place
+        assert getattr(theirs, name) == pytest.approx(getattr(ours, name), rel=1e-9)

@@ -226,13 +226,6 @@ def test_a_free_body_flies_through_full_turns() -> None:
     assert degrees(errors[times > 2.0].max()) < 0.6
 
 
-@pytest.mark.parametrize("twin", [MujocoSettings(rotor=RotorSettings()), QUADROTOR], ids=["aero", "quadrotor"])
-def test_two_runs_are_the_same_to_the_last_bit(twin: MujocoSettings) -> None:
-    one, other = (MujocoPlant(twin, PERIOD) for _ in range(2))
-    voltages = np.random.default_rng(3).uniform(-10, 10, (300, one.actuators)).tolist()
-    assert _driven(one, voltages) == _driven(other, voltages)
-
-
 def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:
     """One motor turns both joints, the other is in its dead zone; counts are so coarse that all are ours."""
     settings = PlantSettings(rotor=RotorSettings(dead_zone_v=2.0), friction=FrictionSettings(coulomb=()))

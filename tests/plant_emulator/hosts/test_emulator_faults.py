@@ -43,11 +43,6 @@ class Run(Stage):
     """An emulator with faults, driven from tick 8 on, and what its front was passed."""
 
     def __init__(self, *faults: str, lockstep: bool = False, between: Callable[[Run], None] = lambda _: None) -> None:
-        def answer(stage: Stage, measurement: bytes) -> None:
-            counter = WIRE.measurement.counter(measurement)
-            assert counter is not None
-            stage.wires.deliver(WIRE.command.pack(counter, (1, -1)), stage.endpoint.ticked)
-
         def before(stage: Stage) -> None:
             assert isinstance(stage, Run)
             if stage.endpoint.ticked == (-1 if lockstep else CLAIMED_AT):  # in lockstep there is no tick before it
@@ -55,7 +50,8 @@ class Run(Stage):
             between(stage)
 
         loop = LoopSettings(realtime="off", lockstep=lockstep, trace_s=10)
-        super().__init__(loop, WIRE, PlantSettings(faults=list(faults)), between=before, answer=answer)
+        plant = PlantSettings(faults=list(faults))
+        super().__init__(loop, WIRE, plant, between=before, answer=lambda stage, frame: stage.command(frame, (1, -1)))
         self.wires = RecordedWires()
         self.altered = 0
 
@@ -75,7 +71,6 @@ class Run(Stage):
 
     @property
     def events(self) -> list[Notice]:
-        """Events of begins and ends."""
         faults = [notice for notice in self.endpoint.notices if notice.kind == "fault"]
         return [notice for notice in faults if notice.text.startswith(("fault begins", "fault ends"))]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator
-from math import cos, sin
+from math import sin
 from threading import Event
 from typing import Any
 
@@ -13,7 +13,7 @@ import pytest
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
-from aeroloop.plant_emulator.plant import OwnPlant, PlantError
+from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -31,10 +31,7 @@ def stage_of(kind: str, wire: WireSpec, own: dict[str, Any], faults: list[str], 
     count = iter(range(TICKS * 10))
 
     def answer(stage: Stage, frame: bytes) -> None:
-        counter = wire.measurement.counter(frame)
-        assert counter is not None
-        codes = [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)]
-        stage.wires.deliver(wire.command.pack(counter, codes), stage.endpoint.ticked)
+        stage.command(frame, [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)])
 
     def between(stage: Stage) -> None:
         if stage.endpoint.session is None and stage.endpoint.ticked < 0:  # once
@@ -42,15 +39,6 @@ def stage_of(kind: str, wire: WireSpec, own: dict[str, Any], faults: list[str], 
 
     plant = PlantSettings(kind=f"{HERE}:{kind}", own=own, faults=faults)
     return Stage(loop, wire, plant, between=between, answer=answer)
-
-
-def inner_of(stage: Stage) -> Turntable:
-    emulator = stage.driver
-    assert isinstance(emulator, Emulator)
-    own = emulator._faulty.plant
-    assert isinstance(own, OwnPlant)
-    assert isinstance(own._plant, Turntable)
-    return own._plant
 
 
 @pytest.mark.parametrize(("kind", "actuators"), [("Turntable", 1), ("Octoturntable", 8)])
@@ -86,7 +74,7 @@ def test_a_plant_that_fails_trips_is_closed_at_0_v_and_ends_the_loop(method: str
     (tripped,) = [notice for notice in stage.endpoint.notices if notice.kind == "tripped"]
     assert f"Turntable failed in {method}(): RuntimeError: the table broke in {method} (own_plants.py" in tripped.text
     assert tripped.session == "s1"
-    assert (inner_of(stage).closed, inner_of(stage).volts) == (1, (0.0,))
+    assert (Turntable.latest.closed, Turntable.latest.volts) == (1, (0.0,))
 
 
 def test_a_failed_plant_is_replayed_up_to_its_failure() -> None:
@@ -136,17 +124,18 @@ def test_a_machine_is_not_moved_by_a_replay(kind: str, why: str) -> None:
 def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Turntable, "paces", True)
     advance: Callable[[Turntable], None] = Turntable.advance
+    count = iter(range(TICKS + 1))
 
     def late(self: Turntable) -> None:
         advance(self)
-        self.passed = 3 if self._ticks == 10 else 1
+        self.passed = 3 if next(count) == 10 else 1
 
     monkeypatch.setattr(Turntable, "advance", late)
-    stage = stage_of("Turntable", WireSpec(actuators=1), {}, [], lockstep=False)
-    stage.run(TICKS)
+    stage = stage_of("Turntable", WireSpec(actuators=1), {}, [], lockstep=False).run(TICKS)
     assert stage.skipped == 2
-    assert inner_of(stage)._angle != 0
-    assert cos(inner_of(stage)._angle) < 1
+    truth = Turntable.latest.truth()
+    assert truth is not None
+    assert truth.attitude[3] != 0  # it did turn
 
 
 class Cyclic(Turntable):

@@ -63,7 +63,6 @@ class Mischief:
         self._late = random.choice((0, 1, 3, 60))
 
     def skip(self) -> int:
-        """Now and then some ticks; seldom many."""
         random = self._random
         return random.choice((1, 2, 5, 70)) if random.random() < 0.01 else 0
 
@@ -120,7 +119,6 @@ class Mischief:
 
 
 def traced(seed: int) -> tuple[LoopSettings, WireSpec, PlantSettings, list[Batch]]:
-    """A loop that chance disturbs."""
     random = Random(seed)
     loop = LoopSettings(lockstep=random.random() < 0.3, realtime="off", trace_s=0.01)
     wire = random.choice(WIRES)
@@ -150,12 +148,8 @@ def undisturbed() -> tuple[LoopSettings, WireSpec, list[Batch]]:
         if stage.endpoint.session is None and stage.endpoint.ticked < 10:
             stage.claim()
 
-    def answer(stage: Stage, measurement: bytes) -> None:
-        counter = wire.measurement.counter(measurement)
-        assert counter is not None
-        stage.wires.deliver(wire.command.pack(counter, (1, -1)), stage.endpoint.ticked)
-
-    return loop, wire, Stage(loop, wire, PLANT, between=claim, answer=answer).run(600).batches
+    stage = Stage(loop, wire, PLANT, between=claim, answer=lambda stage, frame: stage.command(frame, (1, -1)))
+    return loop, wire, stage.run(600).batches
 
 
 @settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.generate])

@@ -130,7 +130,6 @@ TRIP = Latch(
 
 @contextmanager
 def kept_in(folder: Path) -> Iterator[LatchFile]:
-    """The file of a plant, as one process has it."""
     file = LatchFile(folder, "aero")
     try:
         yield file
@@ -224,7 +223,6 @@ class Plant:
         self._stack.close()
 
     def status(self) -> Status:
-        """Its status."""
         return Status.model_validate_json(self.asker.query("status"))
 
     def stop(self) -> Answer:
@@ -236,11 +234,9 @@ class Plant:
         return self.asker.ask("arm")
 
     def grants(self, *, auto_arm: bool = False) -> bool:
-        """Whether a claim is granted."""
         return isinstance(self.asker.claim(auto_arm=auto_arm), Grant)
 
     def trip(self) -> None:
-        """Trip it in a session; not by an operator."""
         assert self.grants()
         self._role.enqueue(lambda: self.emulator.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
         eventually("the trip", lambda: self.emulator.endpoint.trip is not None)

@@ -123,8 +123,6 @@ TUMBLING = RigidBodySettings(inertia=(0.01, 0.02, 0.03), damping=(0.0, 0.0, 0.0)
 """Nearly about the axis of intermediate inertia, about which no body turns for long: it tumbles over and over."""
 TOP = TUMBLING.model_copy(update={"centre_of_mass": (0.0, 0.0, -0.004)})
 """The same with its weight below the pivot."""
-LOSSLESS = AeroSettings(damping=(0.0, 0.0, 0.0), inertia=(0.01, 0.02, 0.03), centre_of_mass=(0.001, 0.002, -0.0038))
-"""At 0 V it keeps its energy. J_x and J_z differ, which the paper's do not: that couples pitch and yaw."""
 
 
 def _kept(p: AeroSettings | RigidBodySettings, plant: EmulatedPlant) -> tuple[float, float, Array]:

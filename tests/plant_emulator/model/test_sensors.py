@@ -155,14 +155,6 @@ def test_calm_is_no_torque_whatever_the_gusts_and_without_gusts_it_is_steady() -
     assert (_blown(10, 2, torque=(0.1, 0.2, 0.3)) == (0.1, 0.2)).all()
 
 
-def test_gusts_repeat_with_their_seed_and_only_with_it() -> None:
-    n = 5000  # more than one draw of random numbers
-    one, again, other = (_blown(n, gust=0.5, seed=seed) for seed in (1, 1, 2))
-    assert (one == again).all()
-    assert (one != other).all()
-    assert (one[:, 0] != one[:, 1]).all()  # nor do the axes share one gust
-
-
 @pytest.mark.parametrize("period", [0.02, 0.1])
 @pytest.mark.parametrize("axes", [2, 3])
 def test_gusts_have_the_configured_mean_deviation_and_memory_whatever_the_period(axes: int, period: float) -> None:

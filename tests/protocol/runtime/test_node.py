@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
-from aeroloop.protocol.transport.certificate import read_certificate
-from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
-from aeroloop.service.host.operator import gather
-from aeroloop.service.testing.process_group import free_rendezvous
-from tests.support.certificates import Authority
 from tests.support.operated_loop import LEVEL as AT_REST
 from tests.support.operated_loop import Loop, Query
 from tests.support.zenoh_network import Gathering, eventually
@@ -52,20 +45,6 @@ def test_only_a_query_that_names_its_verb_acts() -> None:
         assert done == []
         assert answers("aeroloop/*/stop") == ["aeroloop/aero/stop"]
         assert done == ["stop"]
-
-
-def test_a_status_says_until_when_the_certificate_is_good(tmp_path: Path) -> None:
-    authority = Authority(tmp_path)
-    mine = read_certificate(authority.issue("plant", "aero"))
-    authority.issue("operator")
-    network = NetworkSettings(
-        rendezvous=[free_rendezvous()],
-        security=SecuritySettings(directory=str(authority.folder), vehicles=["aero"]),
-        loopback_secured=True,
-    )
-    with Node("plant", "aero", network, {}) as role:
-        role.status(Status(role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0))
-        assert gather(network).statuses["aero"]["plant"].certificate_until == mine.not_after
 
 
 LONG = Track(reference=Points(times=[float(n) for n in range(MAX_VALUES)], attitudes=[(0.0, 0.0, 0.0)] * MAX_VALUES))

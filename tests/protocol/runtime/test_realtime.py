@@ -71,7 +71,6 @@ def cpu_latency(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def system(
     monkeypatch: pytest.MonkeyPatch, mlockall: Callable[[int], int], schedule: Callable[..., None] = lambda *_: None
 ) -> None:
-    """System calls in place of the kernel's."""
     libc = SimpleNamespace(prctl=lambda *_: 0, mlockall=mlockall)
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: libc)
     monkeypatch.setattr(os, "sched_setscheduler", schedule)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, Throttle, TickGrid, report
 from aeroloop.protocol.wire.spec import LoopSettings
@@ -43,16 +42,6 @@ def test_deadlines_are_absolute_whatever_work_and_sleep_take(work: list[int], ov
         assert clock.now_ns == START + k * period + (oversleep if k else 0)
         clock.now_ns += busy
     assert grid.skipped == 0
-
-
-def test_a_day_of_ticks_does_not_drift() -> None:
-    clock, last = FakeClock(START), 43_200_000  # a day at 500 Hz
-    grid = TickGrid(PERIOD, clock=clock)
-    grid.tick = last - 1
-    clock.now_ns = START + last * PERIOD - 1_000_000
-    assert grid.wait() == last
-    assert clock.now_ns == START + last * PERIOD
-    assert clock.slept == [pytest.approx(1e-3)]
 
 
 @pytest.mark.parametrize(
@@ -99,12 +88,6 @@ def test_a_rate_gives_a_period_in_whole_nanoseconds(rate: float, period_ns: int)
     assert loop.period == pytest.approx(period_ns * 1e-9, rel=2.0**-52)
     assert loop.ticks(50.0) == round(50.0 * rate)
     assert loop.ticks(0.0) == 0
-
-
-@pytest.mark.parametrize("broken", [{"rate_hz": 0.5}, {"rate_hz": 10_001}, {"rate_hz": "nan"}, {"rate": 500}])
-def test_loop_settings_out_of_bounds_are_refused_by_name(broken: dict[str, object]) -> None:
-    with pytest.raises(ValidationError, match=next(iter(broken))):
-        LoopSettings.model_validate(broken)
 
 
 def test_the_first_of_a_kind_passes_and_what_follows_is_held_back_and_counted() -> None:
@@ -169,16 +152,6 @@ def test_an_empty_histogram_has_no_percentile_and_what_is_beyond_the_last_bin_co
     beyond = histogram_of([2**80])
     assert beyond.max_us == pytest.approx(2**80 * 1e-3, rel=2.0**-50)
     assert beyond.percentile(100) == pytest.approx(2.0**32, rel=0.022)  # the last bin's middle, half a bin wide
-
-
-def test_a_histogram_is_of_fixed_size_however_long_it_runs() -> None:
-    durations_ns = [1 << (i % 70) for i in range(20_000)]
-    histogram, twice = histogram_of(durations_ns), histogram_of(durations_ns * 2)
-
-    def size(histogram: Histogram) -> int:
-        return sum(len(kept) if isinstance(kept, (list, dict)) else 1 for kept in vars(histogram).values())
-
-    assert (twice.count, size(twice)) == (40_000, size(histogram))
 
 
 def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_seconds_old() -> None:

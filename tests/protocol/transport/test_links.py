@@ -68,14 +68,12 @@ def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
 
 
 def receive(at: Link | Mailbox, wait_s: float = PATIENCE_S) -> bytes | None:
-    """The next frame."""
     arrival = at.wait(wait_s)
     return None if arrival is None else arrival.frame
 
 
 @pytest.fixture
 def pair() -> Iterator[Sessions]:
-    """Two sessions that see each other."""
     with Gathering() as gathering:
         a, b = gathering.join(), gathering.join()
         eventually("meeting", lambda: bool(a.info.peers_zid()) and bool(b.info.peers_zid()))

@@ -45,7 +45,6 @@ def receives(listener: Listener, speaker: zenoh.Session, word: bytes, key: str =
 
 
 def peers(member: zenoh.Session) -> set[str]:
-    """Ids of the sessions that a session is linked to."""
     return {str(zid) for zid in member.info.peers_zid()}
 
 
@@ -131,7 +130,6 @@ def rude_program() -> Iterator[int]:
 
 
 def one_line(error: BaseException) -> str:
-    """What the user reads."""
     text = str(error)
     assert text
     assert "\n" not in text

@@ -52,7 +52,6 @@ def settings(request: pytest.FixtureRequest, tmp_path: Path) -> NetworkSettings:
 
 @pytest.fixture
 def open_sessions() -> Iterator[ExitStack]:
-    """Closes what a test opens, the last first."""
     with ExitStack() as stack:
         yield stack
 

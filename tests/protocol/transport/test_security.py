@@ -124,7 +124,6 @@ def bare(certificate: Path | None, **tree: Any) -> Iterator[zenoh.Session]:
 
 
 def links(session: zenoh.Session) -> set[str | None]:
-    """Common names of a session's links."""
     return {link.auth_identifier for link in session.info.links()}
 
 
@@ -206,17 +205,6 @@ def test_a_peer_without_tls_is_told_from_one_that_is_halted(network: Secured) ->
     with socket.create_server(("127.0.0.1", 0)) as halted:
         assert refusal(f"tls/127.0.0.1:{halted.getsockname()[1]}", mine) is None
     assert refusal(f"tls/127.0.0.1:{free_port()}", mine) is None
-
-
-def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
-    from aeroloop.service.host.operator import OperatorError, gather
-
-    network.foreign.issue("operator")
-    theirs = network.settings.model_copy(
-        update={"security": SecuritySettings(directory=str(network.foreign.folder), vehicles=["aero"])}
-    )
-    with join(network.settings, PLANT), pytest.raises(OperatorError, match="not of this authority"):
-        gather(theirs)
 
 
 def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(network: Secured) -> None:

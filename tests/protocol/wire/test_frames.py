@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
-from tests.support.wires import COUNTER_BITS, any_counter_bits, wire_of, wires
+from tests.support.wires import COUNTER_BITS, wire_of, wires
 
 Widths = tuple[int | None, ...]
 
@@ -53,7 +53,6 @@ def bit_string(counter: int, counter_bits: int, widths: Widths, codes: Sequence[
 
 
 def codes_in(bits: str, counter_bits: int, widths: Widths) -> Iterator[float]:
-    """The codes in a string of bits."""
     at = -(-counter_bits // 8) * 8 if None in widths else counter_bits
     for width in widths:
         field = bits[at : at + (width or 64)]
@@ -65,7 +64,6 @@ def codes_in(bits: str, counter_bits: int, widths: Widths) -> Iterator[float]:
 
 
 def as_bytes(bits: str) -> bytes:
-    """Eight characters a byte."""
     return bytes(int(bits[i : i + 8], 2) for i in range(0, len(bits), 8))
 
 
@@ -95,7 +93,6 @@ def measured(spec: WireSpec) -> tuple[FrameFormat, Widths]:
 
 
 def commanded(spec: WireSpec) -> tuple[FrameFormat, Widths]:
-    """The same of a command."""
     return spec.command, (spec.voltage.bits,) * spec.actuators
 
 
@@ -168,34 +165,6 @@ def test_every_wrong_length_padding_bit_and_infinite_float_of_every_frame_is_ref
                 assert form.unpack(as_bytes(bit_string(0, form.counter_bits, form.widths, spoiled))) is None
                 with pytest.raises(ValueError, match="infinite"):
                     form.pack(0, spoiled)
-
-
-@pytest.mark.parametrize(
-    ("form", "bits", "size"),
-    [
-        pytest.param(wire_of(8, 8, 6).measurement, 56, 7, id="R=8 measurement"),
-        pytest.param(wire_of(10, 10, 6, 2, 4).measurement, 64, 8, id="R=10 measurement, 4 bits of counter"),
-        pytest.param(wire_of(8, 8, 6).command, 20, 3, id="R=6 command"),
-        pytest.param(wire_of(8, 8, 6, 3).command, 26, 4, id="R=6 command of three"),
-        pytest.param(wire_of(None, None, 6).measurement, 8 + 6 * 64, 49, id="cont measurement"),
-        pytest.param(wire_of(8, 8, None, 2, 10).command, 10 + 2 * 64, 18, id="cont command, 10 bits of counter"),
-    ],
-)
-def test_frames_have_the_sizes_of_the_design(form: FrameFormat, bits: int, size: int) -> None:
-    assert (form.bits, form.size) == (bits, size)
-
-
-def test_without_quantization_the_counter_fills_whole_bytes_before_big_endian_doubles() -> None:
-    codes = (12.5, -24.0)
-    for bits, counter, before in ((4, 15, b"\xf0"), (8, 0x9A, b"\x9a"), (10, 0x2FF, b"\xbf\xc0")):
-        command = wire_of(8, 8, None, counter_bits=bits).command
-        assert command.pack(counter, codes) == before + struct.pack(">2d", *codes)
-        assert command.first_bit == 8 * len(before)
-
-
-@given(any_counter_bits, st.integers(1, 10**9))
-def test_a_frame_is_mistaken_for_a_newer_one_no_sooner_than_the_counter_has_come_round(bits: int, period: int) -> None:
-    assert wire_of(8, 8, 6, counter_bits=bits).freshness_ns(period) == 2**bits * period
 
 
 @pytest.mark.parametrize("bits", range(4, 17))

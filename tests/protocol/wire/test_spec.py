@@ -9,13 +9,10 @@ from hypothesis import given
 from pydantic import ValidationError
 
 from aeroloop.protocol.wire.quantizer import (
-    CodedQuantizer,
     Continuous,
-    HysteresisQuantizer,
-    LogarithmicQuantizer,
     UniformQuantizer,
 )
-from aeroloop.protocol.wire.spec import Kind, SignalBits, SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import SignalBits, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Transmit
 from tests.support.wires import any_width, signals, specs, wire_of, wires
 
@@ -71,25 +68,6 @@ def test_a_signal_gives_its_quantizer(signal: SignalSpec) -> None:
         # Half a step, rounded twice, unless given.
         expected = signal.limit / (2**signal.bits - 1) if signal.deadzone is None else signal.deadzone
         assert quantizer.deadzone == pytest.approx(expected, rel=2.0**-50)
-
-
-@pytest.mark.parametrize(
-    ("kind", "made", "parameter"),
-    [
-        ("uniform", UniformQuantizer, {}),
-        ("hysteresis-uniform", HysteresisQuantizer, {"hysteresis": 0.25}),
-        ("logarithmic-uniform", LogarithmicQuantizer, {"threshold": 0.75}),
-    ],
-)
-def test_a_signal_has_the_quantizer_that_it_names(
-    kind: Kind, made: type[CodedQuantizer], parameter: dict[str, float]
-) -> None:
-    quantizer = SignalSpec(bits=8, limit=2.0, kind=kind, deadzone=0.01, **parameter).quantizer()
-    assert type(quantizer) is made
-    assert {name: getattr(quantizer, name) for name in ("deadzone", *parameter)} == {"deadzone": 0.01, **parameter}
-    free = SignalSpec.model_validate({"bits": "cont", "limit": 1.0, "kind": kind})
-    assert free == SignalSpec(bits=None, limit=1.0, kind=kind)
-    assert isinstance(free.quantizer(), Continuous)
 
 
 @given(specs)

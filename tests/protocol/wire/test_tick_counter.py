@@ -29,7 +29,6 @@ class Run(NamedTuple):
 
 @st.composite
 def runs(draw: st.DrawFn) -> Run:
-    """Any such run."""
     counters = 2 ** draw(st.sampled_from([4, 5, 8, 10]))
     offset_ns = draw(st.integers(-(10**18), 10**18))
     period_ns = PERIOD_NS * (1 + draw(st.sampled_from([-0.01, -0.003, 0.0, 0.005, 0.01])))

@@ -61,12 +61,6 @@ def test_where_ticks_are_missed_a_change_still_reaches_a_receiver_that_drops_rep
         assert ticks_wrong == 0 or k % COUNTERS == echo
 
 
-@given(RUN)
-def test_a_periodic_sender_sends_at_every_tick(run: list[tuple[int, int]]) -> None:
-    sender = Sender("periodic", 3, COUNTERS)
-    assert all(sender.due(k, codes) for k, codes in enumerate(run))
-
-
 def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None:
     sender = Sender("on_change", 7, COUNTERS)
     for start in (0, 3, 3 + COUNTERS):

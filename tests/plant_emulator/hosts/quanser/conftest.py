@@ -9,7 +9,7 @@ import pytest
 
 from aeroloop.plant_emulator.hosts import quanser_board
 from tests.support import fake_quanser
-from tests.support.quanser_board import HandClock
+from tests.support.clock import FakeClock
 
 
 @pytest.fixture(autouse=True)
@@ -21,9 +21,8 @@ def no_package() -> Iterator[None]:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> HandClock:
-    """The clock of plant and board."""
-    hand = HandClock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
+    hand = FakeClock()
     monkeypatch.setattr(quanser_board, "time", hand)
     monkeypatch.setattr(fake_quanser, "time", hand)
     return hand

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import numpy as np
 import pytest
 
-from tests.support.fake_quanser import BufferOverflowMode, FakeHIL, FakeQuanser, HILError, MisuseError
-from tests.support.quanser_board import AERO, OFF, PERIOD, VOLTS, WATCHDOG, drive, plant_on_board
+from tests.support.fake_quanser import BufferOverflowMode, FakeHIL, FakeQuanser, MisuseError
+from tests.support.quanser_board import AERO, PERIOD
 
 CH = np.array([0, 1], dtype=np.uint32)
 JOINTS = np.array([2, 3], dtype=np.uint32)
@@ -21,13 +20,9 @@ BOARD = FakeQuanser(AERO, PERIOD)
 """To be misused: its Aero is never moved, and building one takes a tenth of a second."""
 
 
-def handle_of(board: FakeQuanser) -> FakeHIL:
-    return board.HIL()
-
-
 def opened(board: FakeQuanser = BOARD) -> FakeHIL:
     board.holder = board.task = board.watchdog = None
-    handle = handle_of(board)
+    handle = board.HIL()
     handle.open("quanser_aero2_usb", "0")
     return handle
 
@@ -85,29 +80,3 @@ def test_it_refuses_what_c_would_misread_or_a_board_would_not_bear(
     handle = ready()
     with pytest.raises(MisuseError):
         use(handle)
-
-
-def test_it_leaves_buffers_as_they_were_when_a_read_fails() -> None:
-    """So code that takes them for new has old data, as with the usual class for this board."""
-    handle, began = started(), BOARD.time
-    counts = np.array([123, 456], dtype=np.int32)
-    BOARD.fail_next("task_read")
-    with pytest.raises(HILError):
-        handle.task_read(BOARD.task, 1, None, counts, None, None)
-    BOARD.short_next()
-    assert handle.task_read(BOARD.task, 1, None, counts, None, None) == 0
-    assert counts.tolist() == [123, 456]
-    assert BOARD.time == began + 2  # both samples are lost
-
-
-def test_it_restores_outputs_as_they_were_when_its_watchdog_is_cleared() -> None:
-    """The worst that can be read into the documentation: after a watchdog is cleared, 0 V must be written at once."""
-    plant, board = plant_on_board()
-    drive(plant, 1)
-    board.let_pass(WATCHDOG + 1)
-    assert board.motor_voltages == OFF
-    handle = cast(FakeHIL, board.holder)
-    with pytest.raises(HILError, match="expired"):
-        handle.write_analog(CH, 2, ZERO)
-    handle.watchdog_clear()
-    assert board.motor_voltages == VOLTS

@@ -33,7 +33,6 @@ class Loop:
         self.k = 0
 
     def tick(self) -> tuple[bytes | None, bytes | None]:
-        """Command and the measurement that follows."""
         assert self.measurement is not None
         command = self.controller.tick(self.measurement, self.k)
         self.k += 1

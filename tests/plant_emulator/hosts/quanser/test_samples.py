@@ -10,10 +10,10 @@ import pytest
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.plant_emulator.settings import CardType, QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
+from tests.support.clock import FakeClock
 from tests.support.fake_quanser import FakeQuanser
 from tests.support.quanser_board import (
     Calls,
-    HandClock,
     drive,
     driven_plant,
     emulated_aero,
@@ -146,17 +146,17 @@ def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:
 # A board that samples by the clock
 
 
-def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: HandClock) -> None:
+def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: FakeClock) -> None:
     """They return at once, and samples go on coming: those are not counted twice."""
     plant, board = plant_on_board(realtime=True)
-    began = clock.ns
+    began = clock.now_ns
     plant.advance()
     board.fail_next("task_read", 10)
     for k in range(2, 12):
         plant.advance()
-        assert (clock.ns, plant.passed) == (began + k * PERIOD_NS, 1)
+        assert (clock.now_ns, plant.passed) == (began + k * PERIOD_NS, 1)
     plant.advance()  # finds the sample of the last failed read, at once: the one period that is counted twice
-    assert (clock.ns, plant.passed, board.time) == (began + 11 * PERIOD_NS, 1, 11)
+    assert (clock.now_ns, plant.passed, board.time) == (began + 11 * PERIOD_NS, 1, 11)
     plant.advance()
-    assert (clock.ns, plant.passed, board.time) == (began + 12 * PERIOD_NS, 1, 12)
+    assert (clock.now_ns, plant.passed, board.time) == (began + 12 * PERIOD_NS, 1, 12)
     assert plant.failures == 10
