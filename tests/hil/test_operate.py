@@ -115,5 +115,5 @@ def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(h
     assert hil.status("plant").cause == stopped
     since = hil.status("plant").since
     assert since is not None
-    assert f"plant: {stopped} ({since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" in done(hil, "status")
+    assert f"{stopped} ({since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" in done(hil, "status")
     assert hil.log.trips == [stopped]

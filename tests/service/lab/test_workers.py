@@ -133,6 +133,7 @@ def swept(cluster: LocalCluster, out: Path, kill: int | None = None) -> Sweep:
     return run_sweep(planned(), out, engine=f"dask:{cluster.scheduler_address}", progress=progress)
 
 
+@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
     cluster: LocalCluster, local: bytes, tmp_path: Path
 ) -> None:
@@ -142,6 +143,7 @@ def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
     assert out.read_bytes() == local
 
 
+@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_a_worker_with_several_threads_runs_one_experiment_at_a_time(tmp_path: Path) -> None:
     """Threads of one process share compiled loops."""
     with (
@@ -158,6 +160,7 @@ def alone(_settings: Settings, path: str) -> None:
     os.unlink(path)
 
 
+@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) -> None:
     with open_workers(f"dask:{cluster.scheduler_address}") as workers:
         work = partial(rate_over, divisor=2)
@@ -166,6 +169,7 @@ def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) ->
             workers.rows(partial(rate_over, divisor=0), rates(400))
 
 
+@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
     name = "from aeroloop.service.lab import sweep as w; w.code_version ="
     with Client(cluster.scheduler_address, set_as_default=False) as client:
@@ -176,6 +180,7 @@ def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster
     assert not (tmp_path / "a.parquet").exists()
 
 
+@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_where_there_is_no_scheduler_or_no_worker_one_line_says_so(
     capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -61,7 +61,7 @@ def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step
         assert np.all(reached >= 0.999 * allowed)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_the_largest(seed: int) -> None:
     """Frequencies that share no period, so that every combination of phases comes, some day."""
     rng = np.random.default_rng(seed)
