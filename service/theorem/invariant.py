@@ -181,11 +181,12 @@ def distance(p: Premises, c: Coordinates, sign: Floats, theta_error: Floats, des
         theta_error: θ̃ [N·m·s/rad]. Shape (n, 3).
         desired_rate: ω_d in the desired body frame [rad/s]. Shape (n, 3).
     """
-    eps, share = sign[:, None] * c.eps_e, np.array(p.law.share)
+    eps, share, linear = sign[:, None] * c.eps_e, np.array(p.law.share), responses(p.axes)
     if p.tilt is None:
         balance = -desired_rate * theta_error / np.array(p.law.kp) * (np.array(p.law.ki) == 0)
-        return norm(np.hstack([eps - balance, c.z2 - share * balance]))
-    linear, farthest = responses(p.axes), reach(p, largest_start(p))
+        steady = 0.0 if linear is None else linear.z * p.steady  # balanced in a direction that is not known
+        return norm(np.hstack([eps - balance, c.z2 - share * balance])) + steady
+    farthest = reach(p, largest_start(p))
     return norm(np.hstack([eps, c.z2])) + (inf if farthest is None or linear is None else linear.z * farthest.slow)
 
 
@@ -274,13 +275,14 @@ def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     # What drives the linear equations.
     push_dot = law.theta_error * p.k_omega_d_dot + p.axis_rate * theta_dot + p.steady * omega
     d2 = fast + (law.radius if law.virtual else law.theta_error) * omega_e  # θ̃ acts on ω_e
-    if p.tilt is not None:
-        fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
     d4 = delta_omega_e + share * delta_q + p.period * (omega_e_dot + share * at["eps_dot"])
     hold += ki * p.encoder.angle  # an integral of the encoders' ripple is that angle
     gap = at["gap"] + p.lag * rest_dot + 2 * noise + hold + steady * p.encoder.ripple
     gap += 2 * steady * p.encoder.angle / p.lag if p.lag else 0.0
     d5 = noise + hold + p.uneven * gap
+    if p.tilt is not None:
+        fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
+        d2 += (j / min(p.J) - 1) * (d5 + steady * p.encoder.ripple)
     deviation = (
         at["feedback"] + slow + noise + law.coulomb + steady * p.encoder.ripple + law.estimate * axis_omega
         + p.weight * 2 * eps_e + spread * omega**2 + alpha * zeta * omega_e
