@@ -17,8 +17,8 @@ from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.reference import Angles, Floats, Plan
 from aeroloop.service.theorem.certificate import premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
-from aeroloop.service.theorem.invariant import Premises, Reach, largest_start, reach, without_error
-from aeroloop.service.theorem.lemma import rotation, times
+from aeroloop.service.theorem.invariant import Premises, Reach, distance, largest_start, reach, without_error
+from aeroloop.service.theorem.lemma import coordinates, rotation, times
 from aeroloop.service.theorem.linear import Axis, responses, system
 from aeroloop.service.theorem.plant_bounds import EncoderRate, PlantBounds
 
@@ -316,3 +316,11 @@ def test_without_error_is_part_of_every_set() -> None:
     assert isinstance(at, Reach)
     assert least.axis_rate <= at.axis_rate
     assert least.deviation <= at.deviation
+
+
+def test_a_body_on_its_reference_is_as_far_from_balance_as_a_steady_torque_pushes_it() -> None:
+    p = replace(of(settings_of(10)), steady=0.002)
+    q, still, one = np.array([[1.0, 0.0, 0.0, 0.0]]), np.zeros((1, 3)), np.ones(1)
+    at_rest = coordinates(q, still, q, still, one, np.array(p.law.share))
+    away = distance(p, at_rest, one, still, still)
+    assert away[0] == pytest.approx(np.hypot(1, p.law.share[0]) / p.law.kp[0] * 0.002)
