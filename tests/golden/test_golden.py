@@ -10,7 +10,6 @@ import pytest
 
 from tests.golden.make import HERE, LOGS, expected
 
-
 FIGURES: Final = 1e-11
 """Relative tolerance of figures. NumPy sums and takes sines with the vector instructions of the processor, so the last
 bits of a figure are the machine's (2e-13 between two of ours). Counts, texts and replayed bytes have no tolerance."""
