@@ -21,7 +21,7 @@ from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
 from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
-from aeroloop.service.config_sources import VehicleAddress, merge, sources, tree_of
+from aeroloop.service.config_sources import Target, merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import LawSection, own_settings
@@ -55,7 +55,7 @@ OneReference = Annotated[
 ]
 
 
-class Settings(VehicleAddress):
+class Settings(Target):
     """Everything that can be configured; sections as in the TOML file."""
 
     loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")

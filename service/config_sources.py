@@ -1,17 +1,17 @@
 """Sources of the configuration: a TOML file, the environment and `--set`, each as a tree of sections and keys.
 
-`VehicleAddress` is all that a command of `aeroloop op` reads of them.
+`Target` is all that a command of `aeroloop op` reads of them.
 """
 
 from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, Field, StringConstraints, ValidationError, model_validator
+from pydantic import BaseModel, Field, StringConstraints, ValidationError, create_model, model_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
@@ -21,20 +21,21 @@ from aeroloop.protocol.wording import closest, keys, problems
 ENV_PREFIX: Final = "AEROLOOP_"
 """Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
 
-
 BODY: Final = ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
 """The model of the plant in `[law]`, which all laws have."""
+
+UNREAD: Final = ("loop", "wire", "reference", "law", "controller", "plant", "can", "recorder")
+"""Sections that a `Target` does not read."""
+
+_FREE: Final = ("can.options.", "plant.own.", "law.")
+"""Sections in which any key may be given: a user's, or another library's."""
 
 
 class ConfigError(AeroloopError):
     """The configuration is wrong; one line with the key and its allowed values."""
 
 
-UNREAD: Final = ("loop", "wire", "reference", "law", "controller", "plant", "can", "recorder")
-"""The other sections of a configuration."""
-
-
-class VehicleAddress(BaseModel, extra="forbid", coerce_numbers_to_str=True):
+class Target(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """Name of a vehicle, and the network on which it is."""
 
     vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
@@ -70,11 +71,11 @@ def sources(
     """
     if file is not None:
         yield _read(file)
-    yield _environment(model, unread)
+    yield tree_of(_environment(model, unread))
     yield tree_of(overrides)
 
 
-def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
+def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
     """The tree of `section.key=value` overrides. Raises ConfigError."""
     tree: dict[str, Any] = {}
     for override in overrides:
@@ -87,21 +88,15 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
 
 def merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
     """Put the values of one tree into another. A reference or a law of another kind replaces the one that is there."""
-    value: Any
-    present: Any
     for name, value in changes.items():
-        present = tree.get(name)
-        # A reference or a law of another kind has other keys; the kinds of a quantizer share theirs.
-        other_kind = name in ("reference", "law") and isinstance(value, dict) and "kind" in value
-        if (
-            isinstance(value, dict)
-            and isinstance(present, dict)
-            and not (other_kind and value["kind"] != present["kind"])
-        ):
-            merge(present, value)
+        present: Any = tree.get(name)
+        if not (isinstance(value, dict) and isinstance(present, dict)):
+            tree[name] = value
+        elif name in ("reference", "law") and value.get("kind", present.get("kind")) != present.get("kind"):
+            kept = BODY if name == "law" else ()  # another kind has other keys; all laws have the body
+            tree[name] = {key: present[key] for key in kept if key in present} | value
         else:
-            same = {key: present[key] for key in BODY if key in present} if other_kind and name == "law" else {}
-            tree[name] = {**same, **value} if same else value
+            merge(present, value)
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -119,31 +114,25 @@ def _read(file: Path) -> dict[str, Any]:
     return tree
 
 
-def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, Any]:
+def _environment(model: type[BaseModel], unread: Collection[str]) -> Iterator[str]:
+    """Variables of the environment as overrides, without those of the sections that are not read."""
     given = {name: text for name, text in os.environ.items() if name.upper().startswith(ENV_PREFIX)}
     known = {key.upper(): key for key in keys(model)} if given else {}
-    tree: dict[str, Any] = {}
     for name, text in sorted(given.items()):
         key = name[len(ENV_PREFIX) :].replace("__", ".")
-        free = next((each for each in _FREE if key.lower().startswith(each)), None)
         if key.lower().partition(".")[0] in unread:
             continue
         if key.upper() in known:
             key = known[key.upper()]
-        elif free is not None:  # in lower case, or as written if in mixed case
-            own = key[len(free) :]
-            key = free + (own.lower() if own.isupper() else own)
+        elif free := next((section for section in _FREE if key.lower().startswith(section)), None):
+            rest = key[len(free) :]
+            key = free + (rest.lower() if rest.isupper() else rest)  # as written if in mixed case
         else:
             found = closest(key, known.values())
             variable = ENV_PREFIX + (found or "").upper().replace(".", "__")
             hint = f"did you mean {variable}?" if found else "unset it, or see `aeroloop show config`"
             raise ConfigError(f"{name} in the environment is no setting: {hint}")
-        _put(tree, key, _value(text))
-    return tree
-
-
-_FREE: Final = ("can.options.", "plant.own.", "law.")
-"""Sections in which any key may be given: a user's, or another library's."""
+        yield f"{key}={text}"
 
 
 def _put(tree: dict[str, Any], key: str, value: Any) -> None:
@@ -162,7 +151,7 @@ def _value(text: str) -> Any:
         return text
 
 
-def load_vehicle_address(file: Path | None = None, overrides: Sequence[str] = ()) -> VehicleAddress:
+def load_target(file: Path | None = None, overrides: Sequence[str] = ()) -> Target:
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
     Why nothing else is read: `aeroloop op` starts sooner, and a mistake in another section does not keep it from
@@ -172,15 +161,11 @@ def load_vehicle_address(file: Path | None = None, overrides: Sequence[str] = ()
         ConfigError: A source cannot be read, a section is unknown, or vehicle or network is wrong.
     """
     tree: dict[str, Any] = {}
-    for given in sources(file, overrides, VehicleAddress, UNREAD):
+    for given in sources(file, overrides, Target, UNREAD):
         merge(tree, {name: value for name, value in given.items() if name not in UNREAD})
-    sections = (*VehicleAddress.model_fields, *UNREAD)
-    for name in set(tree).difference(sections):
-        found = closest(name, sections)
-        raise ConfigError(
-            f"unknown key {name}" + (f": did you mean {found}?" if found else f"; there are {', '.join(sections)}")
-        )
     try:
-        return VehicleAddress.model_validate(tree)
+        return Target.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError("; ".join(problems(error, VehicleAddress))) from None
+        others: dict[str, Any] = dict.fromkeys(UNREAD, (Any, None))
+        sections = create_model("Sections", __base__=Target, **others)
+        raise ConfigError("; ".join(problems(error, sections))) from None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
-    from aeroloop.service.config_sources import VehicleAddress
+    from aeroloop.service.config_sources import Target
     from aeroloop.service.terminal.show import Sheets
 
 log: Final = logging.getLogger("aeroloop")
@@ -104,12 +104,12 @@ def loop_of(config: Path | None, overrides: Sequence[str] | None, *more: str) ->
         return with_law_settings(settings_of(config, overrides, *more))
 
 
-def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleAddress:
+def target_of(config: Path | None, overrides: Sequence[str] | None) -> Target:
     """Vehicle and network of the effective configuration; a configuration error ends the command."""
-    from aeroloop.service.config_sources import load_vehicle_address
+    from aeroloop.service.config_sources import load_target
 
     with checked():
-        return load_vehicle_address(config, overrides or ())
+        return load_target(config, overrides or ())
 
 
 def with_bits_of(settings: Settings, bits: str | None) -> Settings:

@@ -11,11 +11,11 @@ from aeroloop.service.cli.common import (
     Config,
     Json,
     Overrides,
-    address_of,
     checked,
     guarded,
     settings_of,
     show,
+    target_of,
     working,
 )
 
@@ -152,5 +152,5 @@ def _folder(given: Path | None, config: Path | None, overrides: list[str] | None
     """The folder that is given, else the configured one, else the default."""
     if given is None:
         with checked():
-            given = address_of(config, overrides).network.security.folder or DEFAULT_KEYS
+            given = target_of(config, overrides).network.security.folder or DEFAULT_KEYS
     return given.expanduser().absolute()

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, address_of, checked, fail, guarded
+from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, target_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from aeroloop.protocol.messages.models import SessionRecord
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
-    from aeroloop.service.config_sources import VehicleAddress
+    from aeroloop.service.config_sources import Target
 
 Three = tuple[float, float, float]
 Within = Annotated[
@@ -49,12 +49,12 @@ def status(
     overrides: Overrides = None,
 ) -> None:
     """Print the status of every role on the network. Exits with 1 if no role answers."""
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
     with guarded():
-        found = gather(address.network)
+        found = gather(target.network)
     well = not check or not troubles(found)
     if json:
         from json import dumps
@@ -80,12 +80,12 @@ def status(
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
     """Show every vehicle and role on the network, live; q quits."""
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     from aeroloop.service.terminal.monitor import watch
 
     with guarded():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
-        watch(address.network)
+        watch(target.network)
 
 
 @group.command()
@@ -96,11 +96,11 @@ def show(
     overrides: Overrides = None,
 ) -> None:
     """Print gains and reference as the commands that set them."""
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     from aeroloop.service.host.operator import show as record_of
 
     with guarded():
-        record = record_of(address.network, address.vehicle, last=last)
+        record = record_of(target.network, target.vehicle, last=last)
     if json:
         typer.echo(record.model_dump_json(indent=2))
     else:
@@ -142,7 +142,7 @@ def as_commands(record: SessionRecord, options: Sequence[str] = ()) -> list[str]
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant for the next claim. Controllers that hold or are faulted claim again."""
-    _send(address_of(config, overrides), "arm")
+    _send(target_of(config, overrides), "arm")
 
 
 @group.command()
@@ -152,12 +152,12 @@ def stop(
     overrides: Overrides = None,
 ) -> None:
     """Stop the vehicle's plant at once: 0 V until `op arm`. All plants if no vehicle is configured."""
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
     with guarded():
-        configured = "vehicle" in address.model_fields_set
-        answers, failures = stop_plants(address.network, address.vehicle if configured and not every else None)
+        configured = "vehicle" in target.model_fields_set
+        answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
     for line in answers:
         typer.echo(line)
     if failures:
@@ -167,7 +167,7 @@ def stop(
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle, for another one. It holds until `op arm`."""
-    _send(address_of(config, overrides), "stand_down")
+    _send(target_of(config, overrides), "stand_down")
 
 
 @group.command()
@@ -187,19 +187,19 @@ def inject(
     from aeroloop.plant_emulator.faults.language import Fault
     from aeroloop.protocol.messages.operator import Inject
 
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     if not (faults or clear):
         fail("name a fault, such as rate:off@1..2, or give --clear", 2)
     with checked():
         message = Inject(faults=[str(Fault.parse(text)) for text in faults or ()], clear=clear)
-    _send(address, "inject", message)
+    _send(target, "inject", message)
 
 
 @group.command("set-gains", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def set_gains(context: typer.Context, config: Config = None, overrides: Overrides = None) -> None:
     """Change gains of the law between two ticks. Each is --NAME and its numbers: --C2 0.2 0.2 0.2; others stay."""
-    address = address_of(config, overrides)
-    _send(address, "set_gains", gains_from(context.args))
+    target = target_of(config, overrides)
+    _send(target, "set_gains", gains_from(context.args))
 
 
 def gains_from(words: Sequence[str]) -> Gains:
@@ -239,10 +239,10 @@ def goto(
     """Brake, turn to an attitude and hold it."""
     from aeroloop.protocol.messages.operator import Hold, Track
 
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     with checked(Track, Hold):
         track = Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s)
-    _send(address, "track", track)
+    _send(target, "track", track)
 
 
 @group.command()
@@ -268,7 +268,7 @@ def track(
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.points_file import read_points
 
-    address = address_of(config, overrides)
+    target = target_of(config, overrides)
     given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
     options = {name: value for name, value in given.items() if value is not None}
     kinds: dict[str, type[Message]] = {"sinusoid": Sinusoid, "hold": Hold, "stream": Stream}
@@ -281,12 +281,12 @@ def track(
         elif what != "configured":
             reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
-    _send(address, "track", message)
+    _send(target, "track", message)
 
 
-def _send(address: VehicleAddress, topic: str, message: Message | None = None) -> None:
+def _send(target: Target, topic: str, message: Message | None = None) -> None:
     from aeroloop.protocol.messages.operator import Request
     from aeroloop.service.host.operator import send
 
     with guarded():
-        typer.echo(send(address.network, address.vehicle, topic, message or Request()))
+        typer.echo(send(target.network, target.vehicle, topic, message or Request()))

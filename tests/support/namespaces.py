@@ -19,7 +19,7 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.config_sources import load_vehicle_address
+from aeroloop.service.config_sources import load_target
 
 STOP_WAIT_S: Final = 10.0
 RECOVERY_S: Final = 10.0
@@ -129,7 +129,7 @@ class Hosts:
     @property
     def network(self) -> NetworkSettings:
         """The network of the configuration, or without one the rendezvous in plain text."""
-        configured = load_vehicle_address(self._config).network if self._config else None
+        configured = load_target(self._config).network if self._config else None
         return configured or NetworkSettings(rendezvous=self.rendezvous, insecure=True)
 
     def log(self, host: str) -> Path:

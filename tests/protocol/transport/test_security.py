@@ -29,7 +29,7 @@ from aeroloop.protocol.transport.network_settings import (
 )
 from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.transport.zenoh_config import tls_config
-from aeroloop.service.config_sources import load_vehicle_address
+from aeroloop.service.config_sources import load_target
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import DAY, Authority
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
@@ -212,8 +212,8 @@ def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(
     with pytest.raises(NetworkError, match="name them in"):
         protected(nobody, READER)
     keys = f"network.security.directory={network.authority.folder}"
-    of_one = load_vehicle_address(None, ["vehicle=falcon", keys])
+    of_one = load_target(None, ["vehicle=falcon", keys])
     assert of_one.network.security.vehicles == ["falcon"]
-    both = load_vehicle_address(None, ["vehicle=falcon", keys, 'network.security.vehicles=["aero"]'])
+    both = load_target(None, ["vehicle=falcon", keys, 'network.security.vehicles=["aero"]'])
     assert both.network.security.vehicles == ["falcon", "aero"]
-    assert load_vehicle_address().network.security.vehicles == []
+    assert load_target().network.security.vehicles == []

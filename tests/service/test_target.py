@@ -8,12 +8,12 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings
-from aeroloop.service.config_sources import UNREAD, ConfigError, VehicleAddress, load_vehicle_address
+from aeroloop.service.config_sources import UNREAD, ConfigError, Target, load_target
 from aeroloop.service.host import operator
 
 
 def test_every_other_section_is_left_unread() -> None:
-    assert set(UNREAD) == set(Settings.model_fields) - set(VehicleAddress.model_fields)
+    assert set(UNREAD) == set(Settings.model_fields) - set(Target.model_fields)
 
 
 def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
@@ -23,7 +23,7 @@ def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
     file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n')
     monkeypatch.setenv("AEROLOOP_LAW__NONE", "1")
     monkeypatch.setenv("AEROLOOP_NETWORK__PORTS", "3")
-    found = load_vehicle_address(file, ["network.lease_ms=200", "plant.vai=can"])
+    found = load_target(file, ["network.lease_ms=200", "plant.vai=can"])
     assert (found.vehicle, found.network.ports, found.network.lease_ms) == ("beta", 3, 200)
 
 
@@ -32,14 +32,14 @@ def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
 )
 def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
     with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):
-        load_vehicle_address(None, [given])
+        load_target(None, [given])
 
 
 @pytest.mark.parametrize("variable", ["AEROLOOP_NETWORK__PROTS", "AEROLOOP_LOP__RATE_HZ"])
 def test_a_wrong_variable_is_refused(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(variable, "1")
     with pytest.raises(ConfigError, match=f"^{variable} in the environment is no setting"):
-        load_vehicle_address()
+        load_target()
 
 
 def test_every_plant_is_stopped_unless_a_vehicle_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
