@@ -1,26 +1,22 @@
-"""Shared parts of the commands: options, configuration, one-line errors, processes that run until a signal."""
+"""Shared parts of the commands: options, configuration, one-line errors, printing of results."""
 
 from __future__ import annotations
 
 import logging
-import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.cli.entry import INTERRUPTED, end_unstarted
+from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
-    from threading import Event
-
     from pydantic import BaseModel
 
-    from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
     from aeroloop.service.config_sources import Target
     from aeroloop.service.terminal.show import Sheets
@@ -71,7 +67,6 @@ Require = Annotated[
         "latency.p99=2000; theorem=1: unless the run kept to all that is proven.",
     ),
 ]
-LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -197,62 +192,3 @@ def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
 
     with guarded(), writing(path, [config], force=force) as part:
         yield part
-
-
-# ── processes that run until a signal ──
-
-
-def log_as(role: str, log_format: str) -> None:
-    """Log to stderr, as lines of text or of JSON; an error that ends the daemon is logged in the same form."""
-    from aeroloop.service.terminal.log_lines import set_up_logging
-
-    set_up_logging(as_json=log_format == "json")
-    logged_as[:] = [role] if log_format == "json" else []
-
-
-def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None:
-    """Join the network as a role and run until SIGTERM or SIGINT."""
-    begun, stop = _stop_on_signals()
-    from aeroloop.protocol.runtime.node import Node
-    from aeroloop.protocol.runtime.realtime import no_linger
-    from aeroloop.protocol.transport.zenoh_config import THREADS
-    from aeroloop.service.daemon.claim import controller_name
-
-    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
-    if (refused := no_linger()) is not None:
-        log.warning("%s", refused)
-    name = controller_name() if kind == "controller" else None
-    with guarded(), Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
-        begun.set()
-        run(role)
-
-
-def run_alone(run: Callable[[Event], None]) -> None:
-    """Run a process that is no role on the network until SIGTERM or SIGINT."""
-    begun, stop = _stop_on_signals()
-    begun.set()
-    with guarded():
-        run(stop)
-
-
-def _stop_on_signals() -> tuple[Event, Event]:
-    """Events to set once the process has begun, and set by a signal to stop, which before that ends the process.
-
-    Why a thread waits for them: a handler would run in the main thread, where Zenoh may be waiting for a peer, and
-    which may hold the lock of the event that the handler sets: then the process would never end.
-    """
-    from threading import Event, Thread
-
-    begun, stop, signals = Event(), Event(), {signal.SIGTERM, signal.SIGINT}
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; else a closed terminal
-        signals.add(signal.SIGHUP)
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # in each thread that is started from here on
-
-    def wait() -> None:
-        signal.sigwait(signals)
-        if not begun.is_set():
-            end_unstarted()
-        stop.set()
-
-    Thread(target=wait, daemon=True).start()
-    return begun, stop

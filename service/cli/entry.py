@@ -15,8 +15,8 @@ import sys
 INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
 
-DAEMONS = {"controller", "emulator", "plant", "can-node", "router", "recorder"}
-"""Verbs that run until SIGTERM, with exit code 0."""
+DAEMONS = {"controller": "controller", "plant": "plant", "can-node": "node", "router": "router", "recorder": "recorder"}
+"""Verbs that run until SIGTERM, with exit code 0, and the role that each logs as."""
 
 
 def end_at_once(*_: object) -> None:
@@ -34,7 +34,8 @@ def end_unstarted(*_: object) -> None:
 
 def main() -> None:
     """Entry point of the command."""
-    if not DAEMONS.isdisjoint(sys.argv[1:2]):
+    verb = next((word for word in sys.argv[1:] if not word.startswith("--") and word not in ("text", "json")), "")
+    if verb in DAEMONS:
         signal.signal(signal.SIGTERM, end_unstarted)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in a background job
         signal.signal(signal.SIGINT, end_at_once)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -18,11 +18,11 @@ from aeroloop.service.cli.common import (
     checked,
     fail,
     guarded,
-    run_alone,
     settings_of,
     show,
     working,
 )
+from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
     from threading import Event
@@ -39,6 +39,9 @@ Vehicle = Annotated[
 ]
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
 Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
+
+LIVE_HZ: Final = 30.0
+"""Messages a second of each topic to a viewer."""
 
 group = typer.Typer()
 
@@ -72,7 +75,7 @@ def review(
     from aeroloop.service.terminal.display import progress_bar
     from aeroloop.service.terminal.log_sheets import review_sheets
 
-    _check_part(since_s, until_s, "--to")
+    _check_part(since_s, until_s)
     with guarded():
         with progress_bar("reading", 1, hidden=json) as update:
             judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
@@ -122,9 +125,9 @@ def compare(
         fail("; ".join(broken), 1)
 
 
-def _check_part(since_s: float, until_s: float, option: str) -> None:
+def _check_part(since_s: float, until_s: float) -> None:
     if since_s >= until_s:
-        fail(f"--from {since_s:g} is not before {option} {until_s:g}", 2)
+        fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
 
 
 def _check_page(out: Path | None, logs: Sequence[Path], force: bool) -> None:
@@ -164,7 +167,7 @@ def replay(
     from aeroloop.service.logs.replay import replay
     from aeroloop.service.terminal.log_sheets import replay_sheets
 
-    _check_part(since_s, until_s, "--to")
+    _check_part(since_s, until_s)
     with working("replaying", json, 1) as update:
         replayed = replay(logs, overrides or [], update, [end] if end else ENDS, since_s, until_s)
     show(replayed, json, replay_sheets)
@@ -195,7 +198,6 @@ def recover(
 def live(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 8765,
     address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000, help="Messages a second of each topic.")] = 30.0,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -210,7 +212,7 @@ def live(
     def run(stop: Event) -> None:
         from aeroloop.service.viewers.foxglove_server import serve
 
-        serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
+        serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=LIVE_HZ, ready=ready)
 
     run_alone(run)
 
@@ -218,7 +220,7 @@ def live(
 @group.command()
 def export(
     logs: Logs,
-    to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="Format of the new file.")],
+    form: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--format", help="Format of the new file.")],
     out: Annotated[
         Path | None, typer.Option("--out", help="The new file; the log's name with another suffix if left out.")
     ] = None,
@@ -227,13 +229,11 @@ def export(
     ] = None,
     vehicle: Vehicle = None,
     since_s: Since = -inf,
-    until_s: Annotated[
-        float, typer.Option("--until", metavar="S", help="To this time only.", show_default=False)
-    ] = inf,
+    until_s: Until = inf,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Write a log as a table with a row for each tick. With --to mcap: a log with every message decoded."""
+    """Write a log as a table with a row for each tick. With --format mcap: a log with every message decoded."""
     from aeroloop.service.logs.export import export
 
     def sheets(exported: Exported) -> Sheets:
@@ -244,11 +244,11 @@ def export(
         damages = [f"not read, {line}" for line in exported.damages]
         yield "\n".join([f"{exported.out}: {found}", *damages, *map(str, exported.unknown)]), []
 
-    _check_part(since_s, until_s, "--until")
+    _check_part(since_s, until_s)
     with working("exporting", json, 1) as update:
         exported = export(
             logs,
-            to,
+            form,
             out,
             session=session,
             vehicle=vehicle,

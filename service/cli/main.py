@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import takewhile
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import typer
 from typer.exceptions import TyperException
 
 from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import logged_as, report, state
-from aeroloop.service.cli.entry import INTERRUPTED
+from aeroloop.service.cli.entry import DAEMONS, INTERRUPTED
+from aeroloop.service.cli.processes import log_as
 
 _GROUPS: Final = {
     "lab": (lab.group, "Experiments, sweeps, tuning and certificates, in lockstep."),
@@ -106,9 +107,15 @@ def _print_version(requested: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    log_format: Annotated[
+        Literal["text", "json"], typer.Option("--log-format", help="Format of a daemon's log lines on stderr.")
+    ] = "text",
     version: Annotated[  # noqa: ARG001  # its callback prints and ends
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
     ] = False,
 ) -> None:
     state["debug"] = debug
+    if role := DAEMONS.get(context.invoked_subcommand or ""):
+        log_as(role, as_json=log_format == "json")

@@ -16,25 +16,22 @@ from aeroloop.service.cli.common import (
     Config,
     Duration,
     Json,
-    LogFormat,
     NewLog,
     Overrides,
-    log_as,
+    fail,
     loop_of,
-    run_alone,
-    run_role,
     settings_of,
     show,
     with_bits_of,
     working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
+from aeroloop.service.cli.processes import run_alone, run_role
 
 if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.protocol.runtime.node import Node
-    from aeroloop.service.config import Settings
 
 Faults = Annotated[
     list[str] | None,
@@ -52,7 +49,6 @@ group = typer.Typer()
 def demo(
     duration: Duration = PAPER_DURATION_S,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
-    via: Annotated[str | None, typer.Option("--via", metavar="emulator|can", help="Plant end to run.")] = None,
     bits: BitsOption = None,
     log: NewLog = None,
     json: Json = False,
@@ -60,8 +56,7 @@ def demo(
     overrides: Overrides = None,
 ) -> None:
     """Run the paper's experiment in three processes over Zenoh. Then review its log."""
-    options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
-    settings = with_bits_of(loop_of(config, overrides, *options), bits)
+    settings = with_bits_of(loop_of(config, overrides, *(["loop.lockstep=true"] if lockstep else [])), bits)
     from aeroloop.service.lab.demo import run_demo
     from aeroloop.service.terminal.display import demo_progress
     from aeroloop.service.terminal.log_sheets import demo_sheets
@@ -82,19 +77,14 @@ def demo(
 
 @group.command()
 def controller(
-    duration: Annotated[float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.")] = None,
     auto_arm: Annotated[
         bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
     ] = False,
-    log_format: LogFormat = "text",
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
-    log_as("controller", log_format)
-    words = [f"controller.duration_s={duration}"] if duration is not None else []
-    words += ["controller.auto_arm=true"] if auto_arm else []
-    settings = loop_of(config, overrides, *words)
+    settings = loop_of(config, overrides, *(["controller.auto_arm=true"] if auto_arm else []))
 
     def run(role: Node) -> None:
         from aeroloop.service.control.laws.registry import version_of
@@ -110,22 +100,12 @@ def controller(
 
 
 @group.command()
-def emulator(
-    faults: Faults = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
-) -> None:
-    """Run the emulated plant until SIGTERM."""
-    log_as("plant", log_format)
-    _run_plant(settings_of(config, overrides, "plant.via=emulator", *_fault_options(faults)))
-
-
-@group.command()
-def plant(log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None) -> None:
+def plant(faults: Faults = None, config: Config = None, overrides: Overrides = None) -> None:
     """Run the plant end that `plant.via` names until SIGTERM. It is the emulator, a CAN bridge or Quanser's board."""
-    log_as("plant", log_format)
-    _run_plant(settings_of(config, overrides))
+    settings = settings_of(config, overrides, *_fault_options(faults))
+    if faults and settings.plant.via != "emulator":
+        fail(f"--fault is for the emulator, and plant.via is {settings.plant.via}", 2)
 
-
-def _run_plant(settings: Settings) -> None:
     def run(role: Node) -> None:
         from aeroloop.service.daemon.roles import run_plant
 
@@ -135,11 +115,8 @@ def _run_plant(settings: Settings) -> None:
 
 
 @group.command("can-node")
-def can_node(
-    faults: Faults = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
-) -> None:
+def can_node(faults: Faults = None, config: Config = None, overrides: Overrides = None) -> None:
     """Run the emulated plant as a node on the CAN bus."""
-    log_as("node", log_format)
     settings = settings_of(config, overrides, *_fault_options(faults))
 
     def run(stop: Event) -> None:
@@ -157,9 +134,8 @@ def _fault_options(faults: list[str] | None) -> list[str]:
 
 
 @group.command()
-def router(log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None) -> None:
+def router(config: Config = None, overrides: Overrides = None) -> None:
     """Run a router for clients until SIGTERM. They have network.mode = "client"."""
-    log_as("router", log_format)
     settings = settings_of(config, overrides)
     from aeroloop.service.daemon.roles import run_router
 
@@ -167,11 +143,8 @@ def router(log_format: LogFormat = "text", config: Config = None, overrides: Ove
 
 
 @group.command()
-def recorder(
-    log: NewLog = None, log_format: LogFormat = "text", config: Config = None, overrides: Overrides = None
-) -> None:
+def recorder(log: NewLog = None, config: Config = None, overrides: Overrides = None) -> None:
     """Record every vehicle on the network into a log until SIGTERM."""
-    log_as("recorder", log_format)
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
     settings = settings_of(config, overrides, *words)
 

@@ -92,7 +92,7 @@ def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
     # systemd starts a plant again by itself, so it is unarmed then; a --set of the user's own comes later and wins.
     unarmed = ["--set", "plant.armed_at_start=false"] if name == "plant" else []
-    words = [*_executable(), name, *unarmed, *source.options]
+    words = [*_executable(), "--log-format", "json", name, *unarmed, *source.options]
     rights = _user(source)
     if name == "plant":
         configured = source.settings.plant.state_directory
@@ -116,7 +116,7 @@ def unit(name: str, source: Source) -> str:
     return _TEMPLATE.format(
         via=source.settings.plant.via,
         what=UNITS[name],
-        command=" ".join(_quoted(word) for word in [*words, "--log-format", "json"]),
+        command=" ".join(_quoted(word) for word in words),
         rights="\n".join(rights),
     )
 

@@ -99,7 +99,7 @@ def export(
 
                 if (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
                     raise ExportError(
-                        "--session, --vehicle, --from and --until choose the rows of a table; --to mcap writes all of "
+                        "--session, --vehicle, --from and --to choose the rows of a table; --format mcap writes all of "
                         "the log"
                     )
                 rows, columns, damages = write_decoded(recording, part, progress or (lambda _: None))

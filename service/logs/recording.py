@@ -392,7 +392,7 @@ def check_memory(needed: int, ticks: int) -> None:
     if needed > available:
         raise ReviewError(
             f"{ticks} ticks take {needed / 2**30:.1f} GiB of memory, and {available / 2**30:.1f} GiB are available: "
-            "`aeroloop log review` reads a part with --from and --to, `aeroloop log export` with --from and --until"
+            "`aeroloop log review` and `aeroloop log export` read a part with --from and --to"
         )
 
 
@@ -416,7 +416,7 @@ def _begin_ns(path: Path) -> int:
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
-    """Files, and those in folders without what `log export --to mcap` wrote there."""
+    """Files, and those in folders without what `log export --format mcap` wrote there."""
     files: list[Path] = []
     for path in paths:
         found = [path]

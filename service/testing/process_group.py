@@ -42,7 +42,6 @@ PRELOADED: Final = (
     "aeroloop.service.daemon.daemon",
     "aeroloop.service.daemon.roles",
     "aeroloop.service.recording.recorder",
-    "aeroloop.service.terminal.log_lines",
     "aeroloop.service.testing.process_group",
     "aeroloop.service.theorem.any_law",
     "aeroloop.service.viewers.channels",

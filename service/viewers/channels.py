@@ -1,7 +1,7 @@
 """Decoder of published messages into topics that Foxglove and Lichtblick show without any configuration.
 
-Sans-I/O; the one converter for `log live`, the recorder's decoded channels and `log export --to mcap`. Topics are under
-`/<vehicle>/`; poses, transforms, the scene and the log are Foxglove's messages, statuses and set-points the network's,
+Sans-I/O; the one converter for `log live`, the recorder's decoded channels and `log export --format mcap`. Topics are
+under `/<vehicle>/`; poses, transforms, scene and log are Foxglove's messages, statuses and set-points the network's,
 the rest are the views of schemas.py, rounded far below a quantizer's step. The plant's trace rows give measurements,
 the controller's rows give commands, at the times of sending on their own wall clocks.
 """

@@ -86,8 +86,8 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
 def _daemons(folder: Path, words: list[str], seconds: float) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Controller, plant and recorder, stopped at the end; each writes to a file that is named for it."""
     verbs = [
-        ["controller", "--auto-arm", f"--duration={seconds}"],
-        ["emulator"],
+        ["controller", "--auto-arm", f"--set=controller.duration_s={seconds}"],
+        ["plant"],
         ["recorder", f"--log={folder}/log.mcap"],
     ]
     processes, state = [], os.environ | {"XDG_STATE_HOME": str(folder)}  # a latch of this host is none of theirs

@@ -93,7 +93,7 @@ def run(overrides: list[str], condition: str, seconds: float, *, certificates: b
         log = Path(name) / "log.mcap"
         processes = [
             hosts.aeroloop("controller", "controller", "--auto-arm", overrides=overrides),
-            hosts.aeroloop("plant", "emulator", overrides=overrides),
+            hosts.aeroloop("plant", "plant", overrides=overrides),
             hosts.aeroloop("controller", "recorder", "--log", str(log), overrides=overrides),
         ]
         eventually("driving", lambda: "has aero" in hosts.log("controller").read_text())

@@ -47,7 +47,7 @@ def main(trials: int) -> None:
     """Run all troubles and print a line for each."""
     with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller", *THIRDS], Path(name)) as hosts:
         folder = Path(name)
-        hosts.aeroloop("plant", "emulator")
+        hosts.aeroloop("plant", "plant")
         hosts.aeroloop("controller", "controller", "--auto-arm")
         hosts.watch("plant", folder / "seen")
         seen, logs = Seen(folder / "seen"), count()

@@ -48,8 +48,8 @@ def make(name: str) -> None:
     settings = dict(each.split("=") for each in LOGS[name])
     with TemporaryDirectory() as folder:
         if settings.get("plant.via") == "can":
-            words = ("demo", "--lockstep", "--via", "can", "--duration", "8", "--set", "recorder.decoded_hz=0")
-            aeroloop(*words, "--log", f"{folder}/can.mcap")
+            words = ("demo", "--lockstep", "--duration", "8", "--set", "plant.via=can")
+            aeroloop(*words, "--set", "recorder.decoded_hz=0", "--log", f"{folder}/can.mcap")
         else:
             with Hil(Path(folder), lockstep=True) as hil:
                 hil.start(settings={"recorder.decoded_hz": 0, **settings})

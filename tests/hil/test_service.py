@@ -17,7 +17,7 @@ def test_a_daemon_notifies_systemd_that_it_is_ready_that_it_lives_and_that_it_st
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(path))
         manager.settimeout(30)  # a process starts within about a second; CI may be busy
-        command = [sys.executable, "-P", "-m", "aeroloop", "emulator", "--log-format", "json"]
+        command = [sys.executable, "-P", "-m", "aeroloop", "--log-format", "json", "plant"]
         daemon = subprocess.Popen(
             [*command, "--set", f"network.rendezvous={free_rendezvous()}"],
             env={**os.environ, "NOTIFY_SOCKET": str(path)},

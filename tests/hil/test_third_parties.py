@@ -34,7 +34,7 @@ def hosts(tmp_path: Path) -> Iterator[Hosts]:
     """Hosts with an emulator and a controller, and a third one that records and watches; the plant is driven."""
     try:
         with Hosts(["plant", "controller", "third"], tmp_path) as hosts:
-            hosts.aeroloop("plant", "emulator", overrides=PATIENT)
+            hosts.aeroloop("plant", "plant", overrides=PATIENT)
             hosts.aeroloop("controller", "controller", "--auto-arm", overrides=PATIENT)
             hosts.watch("plant", tmp_path / "seen")
             eventually("driving", lambda: bool(ticks(tmp_path)))

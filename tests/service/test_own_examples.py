@@ -60,7 +60,7 @@ def test_law_and_plant_run_as_processes_and_their_log_replays(folder: Path) -> N
     assert "No theorem for this law, own_law:OwnPythonLaw." in " ".join(
         run(folder, "log", "review", "run.mcap").split()
     )
-    run(folder, "log", "export", "run.mcap", "--to", "csv")
+    run(folder, "log", "export", "run.mcap", "--format", "csv")
     (table,) = folder.glob("*.csv")
     with table.open() as file:
         rows = list(csv.DictReader(file))

@@ -82,7 +82,7 @@ class Deployment(Hosts):
         self.await_driven(0.0)
 
     def start_daemon(self, host: str, environment: Mapping[str, str] | None = None) -> None:
-        words = {"plant": ["emulator"], "controller": ["controller", "--auto-arm"], "router": ["router"],
+        words = {"plant": ["plant"], "controller": ["controller", "--auto-arm"], "router": ["router"],
                  "recorder": ["recorder", "--log", str(self.log_file)]}[host]  # fmt: skip
         self.daemons[host] = self.aeroloop(host, *words, overrides=self._overrides, environment=environment)
 

@@ -16,8 +16,8 @@ import pytest
 
 from aeroloop.protocol.runtime import node, realtime
 from aeroloop.protocol.transport.zenoh_config import THREADS
-from aeroloop.service.cli.common import run_role
 from aeroloop.service.cli.main import app, execute
+from aeroloop.service.cli.processes import run_role
 from aeroloop.service.config import load
 
 
@@ -45,7 +45,7 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("stop", "did you mean `aeroloop op stop`?"),
         ("op stpo", "Did you mean 'stop'?"),
         ("lab replay", "did you mean `aeroloop log replay`?"),
-        ("emulatr", "Did you mean 'emulator'?"),
+        ("recordr", "Did you mean 'recorder'?"),
         ("demo --set vehicle=a/b", "vehicle"),
         ("demo --duration x", "'--duration'"),
         ("demo --duration 0", "greater than or equal to 0.01"),
@@ -53,9 +53,10 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("op track hold --amplitude 1 2 3", "amplitude"),
         ("op track configured --timeout 1", "configured takes no option but --in"),
         ("op inject rate:x", "drop and garble"),
-        ("log export a.mcap --to foo", "'foo' is not one of 'parquet', "),
+        ("log export a.mcap --format foo", "'foo' is not one of 'parquet', "),
         ("log review a.mcap --from 3 --to 2", "--from 3 is not before --to 2"),
         ("log review a.mcap --session", "see `aeroloop log review --help`"),
+        ("plant --fault rate:off --set plant.via=can", "--fault is for the emulator, and plant.via is can"),
         ('demo --set plant.faults=["rate:x"]', "drop and garble, not "),
     ],
 )

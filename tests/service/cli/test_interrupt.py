@@ -53,7 +53,13 @@ def processes_of(session: int) -> list[int]:
         ("lab experiment", "pydantic.main", signal.SIGINT, 130, []),
         ("lab experiment", "numpy", signal.SIGINT, 130, []),
         ("recorder", "typer.main", signal.SIGTERM, 0, ["aeroloop: ended by a signal before it had started"]),
-        ("recorder", "zenoh", signal.SIGTERM, 0, ["aeroloop: ended by a signal before it had started"]),
+        (
+            "--log-format json recorder",
+            "zenoh",
+            signal.SIGTERM,
+            0,
+            ["aeroloop: ended by a signal before it had started"],
+        ),
     ],
 )
 def test_a_signal_during_an_import_leaves_no_traceback(
@@ -83,7 +89,7 @@ def test_a_daemon_that_is_terminated_while_zenoh_is_opened_ends_at_once_and_says
 
 TERMINATED_IN_WAIT = """
 import os, signal, sys, threading
-from aeroloop.service.cli.common import run_alone
+from aeroloop.service.cli.processes import run_alone
 
 def trace(frame, event, _):
     if frame.f_code is threading.Condition.wait.__code__:  # the event's lock is held

@@ -264,7 +264,7 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
         (tmp_path / "text.mcap", "mat", tmp_path / "a.mat", "text.mcap"),
         (tmp_path / "text.mcap", "mcap", tmp_path / "a.mcap", "text.mcap"),
     ):
-        assert execute(["log", "export", str(source), "--to", to, "--out", str(out)]) == 1
+        assert execute(["log", "export", str(source), "--format", to, "--out", str(out)]) == 1
         captured = capfd.readouterr()
         assert captured.out == ""
         assert len(captured.err.splitlines()) == 1
@@ -281,8 +281,8 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
 
 
 def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Table) -> None:
-    part = ("--from", "0.3", "--until", "0.5")
-    assert execute(["log", "export", str(log), "--to", "parquet", "--out", str(tmp_path / "a.parquet"), *part]) == 0
+    part = ("--from", "0.3", "--to", "0.5")
+    assert execute(["log", "export", str(log), "--format", "parquet", "--out", str(tmp_path / "a.parquet"), *part]) == 0
     table = pyarrow.parquet.read_table(tmp_path / "a.parquet").to_pydict()
     assert table["tick"] == list(range(150, 251))
     begin = parquet["tick"].index(150)
@@ -293,7 +293,7 @@ def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Ta
 
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
-        assert execute(["log", "export", str(log), "--to", to, "--json"]) == 0
+        assert execute(["log", "export", str(log), "--format", to, "--json"]) == 0
         result = json.loads(capfd.readouterr().out)
         out = Path(result["out"])
         assert (out, result["bytes"]) == (log.with_name(name), out.stat().st_size)

@@ -16,8 +16,8 @@ from tests.support.made_log import make_log
 VERBS: Final[dict[str, tuple[str, ...]]] = {
     "review --html": ("log", "review", "a.mcap", "--html", "OUT"),
     "compare --html": ("log", "compare", "a.mcap", "b.mcap", "--html", "OUT"),
-    "export --to csv": ("log", "export", "a.mcap", "--to", "csv", "--out", "OUT"),
-    "export --to mcap": ("log", "export", "a.mcap", "--to", "mcap", "--out", "OUT"),
+    "export --format csv": ("log", "export", "a.mcap", "--format", "csv", "--out", "OUT"),
+    "export --format mcap": ("log", "export", "a.mcap", "--format", "mcap", "--out", "OUT"),
     "recover": ("log", "recover", "a.mcap", "OUT"),
     "burden --figure": ("lab", "burden", "--figure", "OUT", "--duration", "0.1", "--bits", "6/4", "--sensors", "gyro"),
 }

@@ -130,7 +130,7 @@ def test_unrelated_runs_are_refused_by_every_reader(
 ) -> None:
     a = recorded(tmp_path / "a.mcap", made(load(), 200), identities[0])
     b = recorded(tmp_path / "b.mcap", made(load(), 100, session="s2", at_ns=HOUR_NS), identities[1])
-    for command in (("review",), ("replay",), ("export", "--to", "csv"), ("export", "--to", "mcap")):
+    for command in (("review",), ("replay",), ("export", "--format", "csv"), ("export", "--format", "mcap")):
         for logs in ([str(a), str(b)], [str(tmp_path)]):
             assert execute(["log", *command, *logs]) == 1
             (line,) = capfd.readouterr().err.splitlines()

@@ -11,7 +11,7 @@ import pytest
 
 from aeroloop.protocol.messages.models import Event, EventKind
 from aeroloop.protocol.runtime.node import log_event
-from aeroloop.service.terminal import log_lines
+from aeroloop.service.cli.processes import JsonLines
 
 KEYS = ["time", "level", "logger", "event", "role", "vehicle", "session", "tick", "message"]
 
@@ -21,7 +21,7 @@ def test_an_events_line_has_its_fields_as_keys(kind: EventKind, caplog: pytest.L
     event = Event(role="plant", kind=kind, text="100 % of „x“\nin two lines", session="s1", tick=7)
     with caplog.at_level(logging.INFO):
         log_event(event, "aero")
-    line = json.loads(log_lines.JsonLines().format(caplog.records[0]))
+    line = json.loads(JsonLines().format(caplog.records[0]))
     assert list(line) == KEYS
     expected = {"event": kind, "role": "plant", "vehicle": "aero", "session": "s1", "tick": 7, "message": event.text}
     assert {key: line[key] for key in expected} == expected
@@ -30,13 +30,13 @@ def test_an_events_line_has_its_fields_as_keys(kind: EventKind, caplog: pytest.L
 
 def test_another_librarys_line_has_the_same_keys() -> None:
     record = logging.LogRecord("zenoh", logging.ERROR, "a.py", 1, "no %s", ("link",), None)
-    line = json.loads(log_lines.JsonLines().format(record))
+    line = json.loads(JsonLines().format(record))
     assert (list(line), line["message"], line["event"]) == (KEYS, "no link", None)
 
 
 @pytest.mark.parametrize("wrong", [("--set", "loop.rate_hz=x"), ("--config", "no/such.toml")])
 def test_a_daemon_that_cannot_start_logs_one_line_of_json(wrong: tuple[str, str]) -> None:
-    command = [sys.executable, "-P", "-m", "aeroloop", "recorder", "--log-format", "json", *wrong]
+    command = [sys.executable, "-P", "-m", "aeroloop", "--log-format", "json", "recorder", *wrong]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     (line,) = (json.loads(line) for line in done.stderr.splitlines())
     assert (done.returncode, line["level"], line["event"], line["role"]) == (2, "critical", "failed", "recorder")
