@@ -47,7 +47,7 @@ def certify_any(settings: Settings, **options: Any) -> Certificate | OwnCertific
     except ValidationError as error:
         raise NoTheoremError(f"the certificate of law {kind} is none: {problem(error, OwnCertificate)}") from None
     except Exception as error:
-        raise NoTheoremError(f"no certificate: {words_of(kind, error)}") from None
+        raise NoTheoremError(f"no certificate: {words_of(kind, error, law.certify)}") from None
     return certify(settings, **options)
 
 

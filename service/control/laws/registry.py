@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any, Final
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, create_model
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Gains
-from aeroloop.protocol.plugins import PluginError, exception_line, find, source_of
+from aeroloop.protocol.plugins import PluginError, exception_line, find, place_of, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
@@ -134,24 +136,33 @@ def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
         LawError: The settings are wrong, or it is no law for so many actuators.
     """
     law, settings = _class_and_settings(section)
-    try:
+    with naming(section.kind, law):
         return law(settings, period, actuators)
-    except Exception as error:
-        raise LawError(words_of(section.kind, error)) from None
 
 
-def words_of(kind: str, error: Exception) -> str:
-    """What a law of this kind raised, in one line."""
+@contextmanager
+def naming(kind: str, called: Any) -> Iterator[None]:
+    """Raise what the law of this kind raises as LawError; `called` is the function or class of it that runs."""
+    try:
+        yield
+    except Exception as error:  # a user's code may raise anything
+        raise LawError(words_of(kind, error, called)) from None
+
+
+def words_of(kind: str, error: Exception, called: Any) -> str:
+    """What a law of this kind raised in one line, with file and line of a user's: there, or where `called` begins."""
     if kind in BUILT_IN:
         return str(error)
-    return f"law {kind}: {exception_line(error)}"
+    return f"law {kind}: {exception_line(error, called)}"
 
 
 def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettings]:
     law = law_class(section)
     model = getattr(law, "Settings", None)
     if not (isinstance(model, type) and issubclass(model, LawSettings)):
-        raise PluginError(f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings")
+        raise PluginError(
+            f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
+        )
     if isinstance(section, model):
         return law, section
     return law, _valid(model, section.model_dump())
