@@ -137,7 +137,7 @@ def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: f
     except AeroloopError as error:
         raise PlantError(str(error)) from None
     except Exception as error:
-        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.exception_line(error)}") from None
+        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.exception_line(error, found)}") from None
 
 
 class OwnPlant(Plant):
@@ -154,7 +154,9 @@ class OwnPlant(Plant):
         self.paces = plant.paces
         count = getattr(plant, "actuators", None)
         if not (isinstance(count, int) and 1 <= count <= MAX_ACTUATORS):
-            raise self._failure(f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}")
+            raise self._failure(
+                f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}", type(plant)
+            )
         self.actuators = count
 
     def actuate(self, voltages: Sequence[float]) -> None:
@@ -174,10 +176,12 @@ class OwnPlant(Plant):
             (w, x, y, z), (a, b, c) = (map(float, part) for part in measured)
         except (TypeError, ValueError):
             form = "measure() must return Measurement((w, x, y, z), (x, y, z))"
-            raise self._failure(f"measured {_shown(measured)}: {form}") from None
+            raise self._failure(f"measured {_shown(measured)}: {form}", self._plant.measure) from None
         length = hypot(w, x, y, z)
         if isfinite(length) and abs(length - 1) > _UNIT:
-            raise self._failure(f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)")
+            raise self._failure(
+                f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)", self._plant.measure
+            )
         return Measurement((w, x, y, z), (a, b, c))
 
     def truth(self) -> State | None:
@@ -189,9 +193,11 @@ class OwnPlant(Plant):
             (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true)
         except (TypeError, ValueError):
             form = "truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
-            raise self._failure(f"gave {_shown(true)}: {form}") from None
+            raise self._failure(f"gave {_shown(true)}: {form}", self._plant.truth) from None
         if len(voltages) != self.actuators:
-            raise self._failure(f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators")
+            raise self._failure(
+                f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators", self._plant.truth
+            )
         known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
         return State((w, x, y, z), (a, b, c), tuple(voltages)) if known else None
 
@@ -211,12 +217,12 @@ class OwnPlant(Plant):
         try:
             return method(*values)
         except Exception as error:
-            words = str(error) if isinstance(error, AeroloopError) else plugins.exception_line(error)
+            words = str(error) if isinstance(error, AeroloopError) else plugins.exception_line(error, method)
             raise self._failure(f"failed in {method.__name__}(): {words}") from None
 
-    def _failure(self, what: str) -> PlantError:
+    def _failure(self, what: str, called: object = None) -> PlantError:
         self._failed = True
-        return PlantError(f"{self._name} {what}")
+        return PlantError(f"{self._name} {what}{plugins.place_of(called)}")
 
 
 def _shown(value: object) -> str:
