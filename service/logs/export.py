@@ -57,6 +57,7 @@ class Exported(BaseModel, frozen=True):
     bytes: int
     damages: list[str] = Field(description="what of the log could not be read")
     unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
+    left_out: list[str] = Field(default=[], description="other sessions of the log that the table does not have")
 
 
 def export(
@@ -120,6 +121,7 @@ def export(
         bytes=size,
         damages=damages,
         unknown=[one for one in recording.unknown if f"{one.vehicle}/{one.session}" in (sessions or ())],
+        left_out=sorted({"/".join(which) for which in recording.extents}.difference(sessions)) if sessions else [],
     )
 
 

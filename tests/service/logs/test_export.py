@@ -265,6 +265,9 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
         exported = export([log], "parquet", out, session=session)
         table = pyarrow.parquet.read_table(out, columns=["session", "tick"]).to_pydict()
         assert exported.rows == len(table["tick"])
+        everything = {f"{VEHICLE}/{SESSION}", f"{VEHICLE}/{SHORT}"}
+        assert set(exported.sessions or ()) | set(exported.left_out) == everything
+        assert len(exported.sessions or ()) + len(exported.left_out) == 2
         return list(zip(table["session"], table["tick"], strict=True))
 
     first = [(SESSION, k) for k in range(TICKS) if k not in SKIPPED]
@@ -316,6 +319,17 @@ def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Ta
     for name, column in table.items():
         if "delay" not in name:  # the clocks' offset is fitted by what is read
             assert column == parquet[name][begin : begin + 101], name
+
+
+def test_the_command_names_the_sessions_that_it_leaves_out(
+    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for session, left_out in (("1", SHORT), ("2", SESSION), ("all", None)):
+        out = str(tmp_path / f"{session}.csv")
+        assert execute(["log", "export", str(log), "--to", "csv", "--out", out, "--session", session]) == 0
+        printed = capfd.readouterr().out
+        assert (f"not exported of this log: {VEHICLE}/{left_out};" in printed) == bool(left_out)
+        assert ("not exported" in printed) == bool(left_out)
 
 
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
