@@ -12,10 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from math import hypot, isfinite
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ValidationError, create_model
+from pydantic import BaseModel, TypeAdapter, ValidationError, create_model
 
 from aeroloop.protocol import plugins
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.models import Signals
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 from aeroloop.protocol.wording import problems
@@ -32,6 +33,8 @@ BUILT_IN: Final = {
     "mujoco": "aeroloop.plant_emulator.engines.mujoco:MujocoPlant",
     "fmu": "aeroloop.plant_emulator.engines.fmu:FmuPlant",
 }
+
+_SIGNALS: Final[TypeAdapter[Signals]] = TypeAdapter(Signals)
 
 _UNIT: Final = 0.01
 """A quaternion that is this much longer or shorter than 1 is none: values in another order or unit, or a drift."""
@@ -52,11 +55,17 @@ class Measurement(NamedTuple):
 
 
 class State(NamedTuple):
-    """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V]."""
+    """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V].
+
+    `signals` are up to 16 further quantities of the plant by name: wheel speeds, a battery, a temperature. A name has
+    letters, digits and underscores, and ends in its unit (`wheel_1_rad_s`); NaN where a value is not known. They
+    reach the log, the page of a review and the export; no controller receives them.
+    """
 
     attitude: Quaternion
     rate: Vector
     voltages: tuple[float, ...]
+    signals: Mapping[str, float] = {}
 
 
 class NoSettings(BaseModel, extra="forbid"):
@@ -190,16 +199,18 @@ class OwnPlant(Plant):
         if true is None:
             return None
         try:
-            (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true)
+            (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true[:3])
+            signals = {name: float(value) for name, value in dict(*true[3:]).items()}
+            _SIGNALS.validate_python(dict.fromkeys(signals))
         except (TypeError, ValueError):
-            form = "truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
+            form = "truth() must return State((w, x, y, z), (x, y, z), voltages, {'a_name': value, …}) or None"
             raise self._failure(f"gave {_shown(true)}: {form}", self._plant.truth) from None
         if len(voltages) != self.actuators:
             raise self._failure(
                 f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators", self._plant.truth
             )
         known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
-        return State((w, x, y, z), (a, b, c), tuple(voltages)) if known else None
+        return State((w, x, y, z), (a, b, c), tuple(voltages), signals) if known else None
 
     def close(self) -> None:
         """Set 0 V, and release its resources; after a failure as far as that is possible."""

@@ -70,6 +70,24 @@ def test_its_own_exception_is_one_line_with_class_file_and_line(method: str) -> 
     assert str(caught.value).startswith(text)
 
 
+@pytest.mark.parametrize(
+    "signals",
+    [
+        {"two words": 1.0},
+        {"": 1.0},
+        {"α_rad": 1.0},
+        {"a" * 41: 1.0},
+        {"state": "off"},
+        [1.0],
+        {f"n{i}": i for i in range(17)},
+    ],
+)
+def test_signals_that_no_log_would_hold_are_refused(signals: Any) -> None:
+    plant, _ = table(signals=signals)
+    with pytest.raises(PlantError, match=r"Turntable gave .*: truth\(\) must return State"):
+        plant.truth()
+
+
 def test_after_a_failure_it_is_closed_once_and_the_first_failure_stays_the_one_shown() -> None:
     plant, inner = table(fails_in="close", fails_after=0, gives="few")
     plant.advance()
