@@ -12,10 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from math import hypot, isfinite
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ValidationError, create_model
+from pydantic import BaseModel, TypeAdapter, ValidationError, create_model
 
 from aeroloop.protocol import plugins
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.models import Signals
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 from aeroloop.protocol.wording import problems
@@ -32,6 +33,8 @@ BUILT_IN: Final = {
     "mujoco": "aeroloop.plant_emulator.engines.mujoco:MujocoPlant",
     "fmu": "aeroloop.plant_emulator.engines.fmu:FmuPlant",
 }
+
+_SIGNALS: Final[TypeAdapter[Signals]] = TypeAdapter(Signals)
 
 _UNIT: Final = 0.01
 """A quaternion that is this much longer or shorter than 1 is none: values in another order or unit, or a drift."""
@@ -52,11 +55,17 @@ class Measurement(NamedTuple):
 
 
 class State(NamedTuple):
-    """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V]."""
+    """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V].
+
+    `signals` are up to 16 further quantities of the plant by name: wheel speeds, a battery, a temperature. A name has
+    letters, digits and underscores, and ends in its unit (`wheel_1_rad_s`); NaN where a value is not known. They
+    reach the log, the page of a review and the export; no controller receives them.
+    """
 
     attitude: Quaternion
     rate: Vector
     voltages: tuple[float, ...]
+    signals: Mapping[str, float] = {}
 
 
 class NoSettings(BaseModel, extra="forbid"):
@@ -137,7 +146,7 @@ def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: f
     except AeroloopError as error:
         raise PlantError(str(error)) from None
     except Exception as error:
-        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.exception_line(error)}") from None
+        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.exception_line(error, found)}") from None
 
 
 class OwnPlant(Plant):
@@ -154,7 +163,9 @@ class OwnPlant(Plant):
         self.paces = plant.paces
         count = getattr(plant, "actuators", None)
         if not (isinstance(count, int) and 1 <= count <= MAX_ACTUATORS):
-            raise self._failure(f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}")
+            raise self._failure(
+                f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}", type(plant)
+            )
         self.actuators = count
 
     def actuate(self, voltages: Sequence[float]) -> None:
@@ -174,10 +185,12 @@ class OwnPlant(Plant):
             (w, x, y, z), (a, b, c) = (map(float, part) for part in measured)
         except (TypeError, ValueError):
             form = "measure() must return Measurement((w, x, y, z), (x, y, z))"
-            raise self._failure(f"measured {_shown(measured)}: {form}") from None
+            raise self._failure(f"measured {_shown(measured)}: {form}", self._plant.measure) from None
         length = hypot(w, x, y, z)
         if isfinite(length) and abs(length - 1) > _UNIT:
-            raise self._failure(f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)")
+            raise self._failure(
+                f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)", self._plant.measure
+            )
         return Measurement((w, x, y, z), (a, b, c))
 
     def truth(self) -> State | None:
@@ -186,14 +199,18 @@ class OwnPlant(Plant):
         if true is None:
             return None
         try:
-            (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true)
+            (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true[:3])
+            signals = {name: float(value) for name, value in dict(*true[3:]).items()}
+            _SIGNALS.validate_python(dict.fromkeys(signals))
         except (TypeError, ValueError):
-            form = "truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
-            raise self._failure(f"gave {_shown(true)}: {form}") from None
+            form = "truth() must return State((w, x, y, z), (x, y, z), voltages, {'a_name': value, …}) or None"
+            raise self._failure(f"gave {_shown(true)}: {form}", self._plant.truth) from None
         if len(voltages) != self.actuators:
-            raise self._failure(f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators")
+            raise self._failure(
+                f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators", self._plant.truth
+            )
         known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
-        return State((w, x, y, z), (a, b, c), tuple(voltages)) if known else None
+        return State((w, x, y, z), (a, b, c), tuple(voltages), signals) if known else None
 
     def close(self) -> None:
         """Set 0 V, and release its resources; after a failure as far as that is possible."""
@@ -211,12 +228,12 @@ class OwnPlant(Plant):
         try:
             return method(*values)
         except Exception as error:
-            words = str(error) if isinstance(error, AeroloopError) else plugins.exception_line(error)
+            words = str(error) if isinstance(error, AeroloopError) else plugins.exception_line(error, method)
             raise self._failure(f"failed in {method.__name__}(): {words}") from None
 
-    def _failure(self, what: str) -> PlantError:
+    def _failure(self, what: str, called: object = None) -> PlantError:
         self._failed = True
-        return PlantError(f"{self._name} {what}")
+        return PlantError(f"{self._name} {what}{plugins.place_of(called)}")
 
 
 def _shown(value: object) -> str:

@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import entry_points, packages_distributions, version
+from inspect import getsourcefile, getsourcelines
 from pathlib import Path
+from sysconfig import get_path
 from traceback import extract_tb
 from typing import Any, Final, TypeVar
 
@@ -20,6 +22,7 @@ from aeroloop.protocol.errors import AeroloopError
 T = TypeVar("T")
 
 _HERE: Final = str(Path(__file__).parent.parent)
+_PACKAGES: Final = {"site-packages", "dist-packages"}
 
 
 class PluginError(AeroloopError):
@@ -59,12 +62,14 @@ def find(key: str, kind: str, group: str, built_in: Mapping[str, str], base: typ
         raise PluginError(f"{given}: there is no module {error.name} here; {remedy}") from None
     except Exception as error:
         raise PluginError(f"{given}: its module raised {exception_line(error)}") from None
-    classes = {each: value for each, value in vars(module).items() if isinstance(value, type)}
-    if name not in vars(module):
-        raise PluginError(f"{given}: {module_name} has no {name}; its classes are {', '.join(classes) or 'none'}")
-    if name not in classes or not issubclass(classes[name], base):
-        raise PluginError(f"{given} does not derive from aeroloop.{base.__name__}")
-    return classes[name]
+    found = vars(module).get(name)
+    if isinstance(found, type) and issubclass(found, base):
+        return found
+    if found is not None:
+        raise PluginError(f"{given} does not derive from aeroloop.{base.__name__}{place_of(found)}")
+    own = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module_name]
+    names = ", ".join(each.__name__ for each in own if issubclass(each, base)) or "none"
+    raise PluginError(f"{given}: {module_name} has no {name}; its classes of aeroloop.{base.__name__} are {names}")
 
 
 def source_of(plugin: type[Any]) -> str:
@@ -75,9 +80,25 @@ def source_of(plugin: type[Any]) -> str:
     return ", ".join(named + [f"{name} {version(name)}" for name in distributions]) or "unknown"
 
 
-def exception_line(error: BaseException) -> str:
-    """An exception from a user's code in one line: class, text, and the innermost line that is not ours."""
+def exception_line(error: BaseException, called: Any = None) -> str:
+    """An exception from a user's code in one line: class, text, and where it is from.
+
+    That is the innermost line outside of this package and of installed ones, such as CasADi, which would raise it for
+    the user's mistake. Where there is none, as where a result is refused, it is the first line of `called`: the user's
+    function or class.
+    """
     text = " ".join(str(error).split())
     line = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    frames = [frame for frame in extract_tb(error.__traceback__) if not frame.filename.startswith((_HERE, "<frozen"))]
-    return f"{line} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else line
+    ours = _HERE, "<frozen", get_path("stdlib")
+    files = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
+    theirs = [(file, line) for file, line in files if not str(file).startswith(ours) and not _PACKAGES & {*file.parts}]
+    return line + (f" ({theirs[-1][0].name}, line {theirs[-1][1]})" if theirs else place_of(called))
+
+
+def place_of(called: Any) -> str:
+    """Where a function or class is defined, in brackets after a space; nothing where no source is known."""
+    try:
+        file, (_, line) = getsourcefile(called), getsourcelines(called)
+    except (OSError, TypeError):
+        return ""
+    return f" ({Path(file).name}, line {line})" if file else ""

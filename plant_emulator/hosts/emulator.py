@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from math import isfinite
 
 from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
 from aeroloop.plant_emulator.faults.injection import FaultTransition
@@ -72,6 +73,7 @@ class Emulator(Driver):
             attitude=state.attitude,
             rate=state.rate,
             voltages=state.voltages,
+            signals={name: value if isfinite(value) else None for name, value in state.signals.items()},
             session=session,
             session_tick=None if session is None else self.endpoint.session_tick,
         )

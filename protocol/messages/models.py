@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, AwareDatetime, Field, PlainSerializer, StringConstraints
+from pydantic import AfterValidator, AwareDatetime, Field, FiniteFloat, PlainSerializer, StringConstraints
 
 from aeroloop.protocol.messages.operator import REFERENCE_VALUES, Angles, Change, Gains, Message, Reference, Stream
 from aeroloop.protocol.messages.states import TripCause
@@ -41,6 +41,16 @@ SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"),
 
 TokenName = Annotated[str, StringConstraints(pattern=r"^[^/*$#?]{1,64}$")]
 """One chunk of a liveliness token's key, without wildcards."""
+
+
+MAX_SIGNALS: Final = 16
+"""So many fit into the 2 KiB of a true state."""
+
+Signals = Annotated[
+    dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")], FiniteFloat | None],
+    Field(max_length=MAX_SIGNALS),
+]
+"""Further quantities of a plant by name."""
 
 
 class Claim(Message):
@@ -248,6 +258,12 @@ class Truth(Message):
     attitude: tuple[float, float, float, float] = Field(description="q, body relative to inertial [1]")
     rate: tuple[float, float, float] = Field(description="ω, body frame [rad/s]")
     voltages: tuple[float, ...] = Field(description="voltages at the motors [V]")
+    signals: Signals = Field(
+        default={},
+        exclude_if=lambda signals: not signals,
+        description="up to 16 further quantities of the plant by name, `[A-Za-z][A-Za-z0-9_]{0,39}`, which ends in the "
+        "unit; null where not known",
+    )
     session: str | None = Field(default=None, description="session whose measurement was taken of this state, if any")
     session_tick: int | None = Field(default=None, description="that measurement's tick since the session's first")
 

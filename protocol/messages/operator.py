@@ -218,11 +218,12 @@ class Track(Message):
 
     max_values = REFERENCE_VALUES
     reference: Reference | None = Field(description="null: the one that the controller is configured with")
-    within_s: float = Field(
-        default=2.0,
+    within_s: float | None = Field(
+        default=None,
         ge=0.02,
         le=MAX_WITHIN_S,
-        description="time to reach it from the present one; coming to rest takes as long as braking does [s]",
+        description="time to reach it from the present one, null: the shortest; coming to rest takes as long as "
+        "braking does [s]",
     )
 
 

@@ -128,10 +128,10 @@ def certify(
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.theorem.any_law import certify_any
+    from aeroloop.service.theorem.certificate import certificate_of
 
     with guarded():
-        result = certify_any(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+        result = certificate_of(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

@@ -43,6 +43,9 @@ Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time on
 LIVE_HZ: Final = 30.0
 """Messages a second of each topic to a viewer."""
 
+SESSIONS_SHOWN = 9
+"""Sessions that `log export` leaves out and names."""
+
 group = typer.Typer()
 
 
@@ -241,8 +244,12 @@ def export(
             found = f"{exported.rows} messages on {len(exported.columns)} channels"
         else:
             found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
-        damages = [f"not read, {line}" for line in exported.damages]
-        yield "\n".join([f"{exported.out}: {found}", *damages, *map(str, exported.unknown)]), []
+        lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
+        if others := exported.left_out:
+            more = f" and {len(others) - SESSIONS_SHOWN} more" if len(others) > SESSIONS_SHOWN else ""
+            names = ", ".join(others[:SESSIONS_SHOWN]) + more
+            lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
+        yield "\n".join([f"{exported.out}: {found}", *lines]), []
 
     _check_part(since_s, until_s)
     with working("exporting", json, 1) as update:

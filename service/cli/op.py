@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 from shlex import join
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -20,14 +20,9 @@ if TYPE_CHECKING:
 
 Three = tuple[float, float, float]
 Within = Annotated[
-    float,
-    typer.Option(
-        "--in", metavar="S", help="Time to get there, in s; too short a time is refused, and the shortest named."
-    ),
+    float | None,
+    typer.Option("--in", metavar="S", help="Time to get there, in s; the shortest within the limits if left out."),
 ]
-
-WITHIN_S: Final = 2.0
-"""To reach a reference, unless --in says how long [s]."""
 
 group = typer.Typer()
 
@@ -131,7 +126,7 @@ def as_commands(record: SessionRecord, options: Sequence[str] = ()) -> list[str]
             move = ["track", "/dev/stdin"]
             rows = (",".join(numbers([time, *attitude])) for time, attitude in zip(times, attitudes, strict=True))
             table = "\n".join(["", *rows, "END"])
-    move += ["--in", *numbers([record.within_s or WITHIN_S])]
+    move += ["--in", *numbers([record.within_s])] if record.within_s else []
     ended = f"; session {record.session} ended: {record.ended}" if record.ended else ""
     return [
         f"{join(['aeroloop', 'op', 'set-gains', *gains, *options])}  # {record.gains_from}{ended}",
@@ -232,7 +227,7 @@ def goto(
     roll: Annotated[float, typer.Argument(help="Roll, in deg.")],
     pitch: Annotated[float, typer.Argument(help="Pitch, in deg.")],
     yaw: Annotated[float, typer.Argument(help="Yaw, in deg; not wrapped: from 0 to 350 is almost a full turn.")],
-    within_s: Within,
+    within_s: Within = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -251,7 +246,7 @@ def track(
         str,
         typer.Argument(help="configured, sinusoid, hold, stream, or a CSV file of time (s), roll, pitch, yaw (deg)."),
     ],
-    within_s: Within = WITHIN_S,
+    within_s: Within = None,
     amplitude: Annotated[
         Three | None, typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.")
     ] = None,

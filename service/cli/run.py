@@ -89,7 +89,7 @@ def controller(
     def run(role: Node) -> None:
         from aeroloop.service.control.laws.registry import version_of
         from aeroloop.service.daemon.daemon import Daemon
-        from aeroloop.service.theorem.any_law import described_certificate
+        from aeroloop.service.theorem.certificate import described_certificate
 
         daemon = Daemon(role, settings)
         role.own_versions = version_of(settings.law)

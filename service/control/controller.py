@@ -27,13 +27,13 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, parts
 from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 from aeroloop.service.control.laws.evaluation import (
-    check_voltages,
+    check_answer,
     configured_gains,
     initial_state,
     law_function,
 )
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
-from aeroloop.service.control.laws.registry import LawError, law_of, words_of
+from aeroloop.service.control.laws.registry import law_of, words_of
 from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import reference_function
 
@@ -70,7 +70,7 @@ def tick_function(wire: WireSpec, law: Law[Any]) -> ca.Function:
         eta_e, omega_d, omega_d_dot: The rest of what a law in Python computes from.
 
     Raises:
-        ValueError: The law does not fit so many actuators.
+        LawError: The law fails, or does not fit so many actuators.
     """
     laws = law_function(law)
     reference = reference_function()
@@ -171,15 +171,12 @@ class Controller:
         self.invalid = 0
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)
-        try:
-            gains, state = configured_gains(self.law), initial_state(self.law)
-            if isinstance(self.law, ExpressionLaw):
-                settings = self.law.settings.model_dump_json()
-                function = _expressions_function(wire, type(self.law), settings, period)
-            else:
-                function = tick_function(wire, self.law)
-        except Exception as error:
-            raise LawError(words_of(law.kind, error)) from None
+        gains, state = configured_gains(self.law), initial_state(self.law)
+        if isinstance(self.law, ExpressionLaw):
+            settings = self.law.settings.model_dump_json()
+            function = _expressions_function(wire, type(self.law), settings, period)
+        else:
+            function = tick_function(wire, self.law)
 
         sizes = {name: function.numel_out(name) for name in function.name_out()}
         self.row, self._last_row = buffer(sum(sizes.values())), buffer(sum(sizes.values()))
@@ -274,12 +271,11 @@ class Controller:
         )
         try:
             u = np.asarray(law.step(now), dtype=np.float64).ravel()
-            check_voltages(law, u.size)
             after = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in law.state.items()}
-            if {name: values.size for name, values in after.items()} != {n: len(v) for n, v in self._state.items()}:
-                raise ValueError(f"its state after a tick is not that of `reset`: {', '.join(self._state) or 'none'}")
+            first = {name: len(part) for name, part in self._state.items()}
+            check_answer(law, u.size, {name: values.size for name, values in after.items()}, first)
         except Exception as error:  # a user's code may raise anything
-            self.fault = words_of(law.settings.kind, error)
+            self.fault = words_of(law.settings.kind, error, law.step)
             return
         _write_to(inputs["law_voltages"], u)
         _write_to(inputs["law_state"], (value for name in self._state for value in after[name]))

@@ -32,6 +32,7 @@ class ClaimClient:
     Attributes:
         session: The granted session, or None.
         last: Record of the vehicle's last session, from the last grant; None if the plant has none.
+        refusal: Why the plant refused the last claim; empty if it did not.
         by_datagrams: Whether the last claim's frames travel as datagrams.
     """
 
@@ -40,7 +41,7 @@ class ClaimClient:
         self._loop = loop
         self._wire = wire
         self._auto_arm = auto_arm
-        self._refusal = ""
+        self.refusal = ""
         self.session: str | None = None
         self.last: SessionRecord | None = None
         self.by_datagrams = False
@@ -72,11 +73,11 @@ class ClaimClient:
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):
-            self.session, self.last, self._refusal = claim.session, answer.last, ""
+            self.session, self.last, self.refusal = claim.session, answer.last, ""
             return link
         link.close()
-        if answer is not None and answer.reason != self._refusal:
-            self._refusal = answer.reason
+        if answer is not None and answer.reason != self.refusal:
+            self.refusal = answer.reason
             role.event("refused", f"{role.vehicle} refuses: {answer.reason}", claim.session)
         return None
 

@@ -111,7 +111,8 @@ class Daemon:
         name, vehicle, state = self._role.name, self._role.vehicle, self._shared.machine.state
         if state in (State.FAULTED, State.HOLDING):
             return f"{name} is {state}: {self._shared.cause}; `aeroloop op arm` lets it claim {vehicle} again"
-        return f"{name} does not have {vehicle}"
+        refusal = self._shared.claims.refusal
+        return f"{name} does not have {vehicle}" + (f", which refuses: {refusal}" if refusal else "")
 
     def _stand_down(self) -> Answer:
         name, session = self._role.name, self._session

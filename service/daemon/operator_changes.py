@@ -130,8 +130,8 @@ class OperatorChanges:
             self._role.event("changed", f"gains set: {text}", self.record.session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
 
-    def _track(self, reference: Reference, plan: Plan, within_s: float, source: Source) -> Answer:
-        """Follow a checked reference from this tick on, reached in `within_s` [s].
+    def _track(self, reference: Reference, plan: Plan, within_s: float | None, source: Source) -> Answer:
+        """Follow a checked reference from this tick on, reached in `within_s` [s]; None: as soon as the limits allow.
 
         Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
         """
@@ -141,12 +141,13 @@ class OperatorChanges:
             plan = Plan.of(held)
             approach = shortest(plan, motion.here(t), self._limits).at_least(START_S)
         else:
-            approach = shortest(plan, motion.here(t), self._limits).lasting(within_s, self._limits)
+            approach = shortest(plan, motion.here(t), self._limits)
+            approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
         self.setpoints.begin()
         self._follow(held, plan, approach)
         stream = reference if isinstance(reference, Stream) else held
         self._update_record(reference=stream, reference_from=source, since_tick=self._k, **approach._asdict())
-        text = f"{_action_text(reference)} within {approach.within_s:g} s"
+        text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
         self._role.event("changed", text, self.record.session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 

@@ -44,7 +44,7 @@ from aeroloop.service.lab.sweep import (
     sweep_rows,
     write_table,
 )
-from aeroloop.service.theorem.any_law import certify_any
+from aeroloop.service.theorem.certificate import certificate_of
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
 
@@ -294,7 +294,7 @@ def run_comparison(
 def _proven(settings: Settings) -> Row:
     """What is proven of a configuration; of a user's law that certifies itself only whether it holds."""
     try:
-        certificate = certify_any(settings, margins=False)
+        certificate = certificate_of(settings, margins=False)
     except (NoTheoremError, BoundlessError):
         return dict.fromkeys(_PROVEN)
     return {name: getattr(certificate, name, None) for name in _PROVEN}

@@ -8,7 +8,7 @@ the fields `units`, `descriptions` and `config` of its struct; CSV has a header 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from math import inf
 from pathlib import Path
@@ -25,7 +25,7 @@ from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
-from aeroloop.service.logs.session import Array, SessionKey, Unknown
+from aeroloop.service.logs.session import SessionKey, Unknown
 from aeroloop.service.logs.table import Column, TrueStates, columns_of
 from aeroloop.service.logs.ticks import recompute
 
@@ -57,6 +57,7 @@ class Exported(BaseModel, frozen=True):
     bytes: int
     damages: list[str] = Field(description="what of the log could not be read")
     unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
+    left_out: list[str] = Field(default=[], description="other sessions of the log that the table does not have")
 
 
 def export(
@@ -120,6 +121,7 @@ def export(
         bytes=size,
         damages=damages,
         unknown=[one for one in recording.unknown if f"{one.vehicle}/{one.session}" in (sessions or ())],
+        left_out=sorted({"/".join(which) for which in recording.extents}.difference(sessions)) if sessions else [],
     )
 
 
@@ -142,8 +144,8 @@ def _write_table(
         "recorded_by": {role: found.versions for role, found in recording.described(chosen[0]).items()},
         "exported_by": versions(),
     }
-    truths, malformed = _truths(recording, chosen)
-    pieces = _pieces(recording, chosen, times_s, truths)
+    states, malformed = _true_states(recording, chosen)
+    pieces = _pieces(recording, chosen, times_s, states)
     if (first := next(pieces, None)) is None:
         raise ExportError(f"{recording.name} has no answered measurement to export")
     fields = [
@@ -163,33 +165,36 @@ def _pieces(
     recording: Recording,
     chosen: Sequence[SessionKey],
     times_s: tuple[float, float],
-    truths: Mapping[SessionKey, Array],
+    states: TrueStates,
 ) -> Iterator[list[Column]]:
-    """The columns of some sessions, some rows at a time."""
+    """The columns of some sessions of one vehicle, some rows at a time; a signal of any of them is a column of all."""
+    signals = {which: states.signals(which[1]) for which in chosen}
+    names = sorted({name for its in signals.values() for name in its})
     for which in chosen:
+        truth = states.rows(which[1])
+        unknown = np.full(len(truth), np.nan)
+        truth = np.column_stack([truth, *(signals[which].get(name, unknown) for name in names)])
+        truth = np.insert(truth, 0, np.nan, axis=0)
         session = recording.session(which, *times_s)
         ticks = recompute(session).ticks
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
-            at = np.searchsorted(truths[which][:, 0], some.k, side="right")  # 0: before the first
-            yield columns_of(which, some, np.insert(truths[which], 0, np.nan, axis=0)[at], session.settings)
+            at = np.searchsorted(truth[1:, 0], some.k, side="right")  # 0: before the first
+            yield columns_of(which, some, truth[at], session.settings, names)
 
 
-def _truths(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[dict[SessionKey, Array], int]:
-    """Rows of the true states of some sessions, and how many messages are malformed."""
-    actuators: dict[str, dict[str, int]] = {vehicle: {} for vehicle, _ in chosen}
-    for vehicle, session in chosen:
-        actuators[vehicle][session] = recording.settings((vehicle, session)).wire.actuators
-    found = {vehicle: TrueStates(its) for vehicle, its in actuators.items()}
-    malformed = 0
-    for states, message in recording.messages(
-        lambda address: found.get(address.vehicle) if address.topic.name == "truth" else None
+def _true_states(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[TrueStates, int]:
+    """True states of some sessions of one vehicle, and how many messages are malformed."""
+    states = TrueStates({which[1]: recording.settings(which).wire.actuators for which in chosen})
+    vehicle, malformed = chosen[0][0], 0
+    for _, message in recording.messages(
+        lambda address: True if (address.topic.name, address.vehicle) == ("truth", vehicle) else None
     ):
         try:
             states.add(message.data)
         except ValueError:
             malformed += 1
-    return {which: found[which[0]].rows(which[1]) for which in chosen}, malformed
+    return states, malformed
 
 
 # ── Files ──

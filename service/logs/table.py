@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
+from math import nan
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.models import MAX_SIGNALS, Truth
 from aeroloop.protocol.messages.trace import NEVER
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.evaluation import initial_state
@@ -37,6 +38,7 @@ class TrueStates:
     def __init__(self, actuators: Mapping[str, int]) -> None:
         self._actuators = actuators
         self._states = {session: array("d") for session in actuators}
+        self._signals: dict[str, dict[str, array[float]]] = {session: {} for session in actuators}  # tick, value, …
 
     def add(self, data: bytes) -> None:
         """Add a message, unless it is of another session.
@@ -47,14 +49,28 @@ class TrueStates:
         truth = Truth.model_validate_json(data)
         if truth.session is None or truth.session not in self._actuators or truth.session_tick is None:
             return
+        signals = self._signals[truth.session]
         if not 0 <= truth.session_tick < NEVER or len(truth.voltages) != self._actuators[truth.session]:
             raise ValueError("a true state of no tick of its session")
+        if len({*signals, *truth.signals}) > MAX_SIGNALS:
+            raise ValueError("more signals than a plant has")
         self._states[truth.session].extend((truth.session_tick, *truth.attitude, *truth.rate, *truth.voltages))
+        for name, value in truth.signals.items():
+            signals.setdefault(name, array("d")).extend((truth.session_tick, nan if value is None else value))
 
     def rows(self, session: str) -> Array:
         """Tick, q, ω and the motors' voltages, ascending; of a tick, the first. Shape (n, 8 + actuators)."""
         rows = np.frombuffer(self._states[session]).reshape(-1, 8 + self._actuators[session])
         return np.asarray(rows[np.unique(rows[:, 0], return_index=True)[1]])
+
+    def signals(self, session: str) -> dict[str, Array]:
+        """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
+        ticks, signals = self.rows(session)[:, 0], dict[str, Array]()
+        for name, pairs in sorted(self._signals[session].items()):
+            of_tick, first = np.unique(np.frombuffer(pairs)[::2], return_index=True)
+            signals[name] = np.full(len(ticks), np.nan)
+            signals[name][np.searchsorted(ticks, of_tick)] = np.frombuffer(pairs)[1::2][first]
+        return signals
 
 
 class Column(NamedTuple):
@@ -70,10 +86,12 @@ class Column(NamedTuple):
     kind: Kind = "double"
 
 
-def columns_of(which: SessionKey, ticks: Ticks, truth: Array, settings: Settings) -> list[Column]:
+def columns_of(
+    which: SessionKey, ticks: Ticks, truth: Array, settings: Settings, signals: Sequence[str] = ()
+) -> list[Column]:
     """Every column of the table of some ticks of a session, with the latest true state at each; NaN before the first.
 
-    A row of `truth` is a tick, q, ω and the motors' voltages. Shape (n, 8 + actuators).
+    A row of `truth` is a tick, q, ω, the motors' voltages and the plant's `signals`: (n, 8 + actuators + signals).
     """
     wire, period = settings.wire, settings.loop.period
     n = len(ticks.k)
@@ -124,7 +142,8 @@ def columns_of(which: SessionKey, ticks: Ticks, truth: Array, settings: Settings
         *_by("unquantized_voltage_{}_V", "V", "u{} before quantization", ticks.unquantized, motors),
         *_attitude("truth_", "as the emulator had it", truth[:, 1:5]),
         *_by("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", truth[:, 5:8], AXES),
-        *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth[:, 8:], motors),
+        *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth[:, 8 : 8 + len(motors)], motors),
+        *_by("plant_{}", "", "{}, the plant's own signal", truth[:, 8 + len(motors) :], signals),
         Column("truth_age_s", "s", "from the tick of the truth to this one", (ticks.k - truth[:, 0]) * period),
     ]
 

@@ -9,7 +9,7 @@ nothing is decided by it. The first few hundred of each kind become marks and th
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import ceil, inf, isfinite
 from operator import itemgetter
 from typing import Final, NamedTuple
@@ -32,11 +32,12 @@ _MODELS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss"
 
 
 class Truths(NamedTuple):
-    """True states by tick, ascending, none twice. Shapes (n,), (n, 4), (n, 3)."""
+    """True states by tick, ascending, none twice, with the plant's further signals. Shapes (n,), (n, 4), (n, 3)."""
 
     k: Integers
     attitude: Array
     rate: Array
+    signals: Mapping[str, Array] = {}
 
 
 class Published(NamedTuple):
@@ -88,7 +89,7 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
         except ValueError:  # a stranger may publish anything, such as 1e999
             malformed[name] += 1
     rows = states.rows(which[1])
-    truths = Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8])
+    truths = Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8], states.signals(which[1]))
     return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
 
 

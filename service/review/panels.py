@@ -21,6 +21,7 @@ from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.table import euler_deg
 from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
 from aeroloop.service.review.theorem import TheoremCheck, signals
@@ -46,6 +47,9 @@ NUMBERS: Final[dict[Case, dict[str, str]]] = {
 }
 """Number of the paper's figure of a quantity, by case."""
 
+NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))
+"""Of a log without true states."""
+
 _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
 """Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""
 
@@ -59,7 +63,7 @@ def case_of(settings: Settings) -> Case:
 
 
 def panels_of(
-    settings: Settings, ticks: Ticks, theorem: TheoremCheck, points: int = MAX_POINTS
+    settings: Settings, ticks: Ticks, theorem: TheoremCheck, points: int = MAX_POINTS, truths: Truths = NO_TRUTHS
 ) -> tuple[Array, list[Panel], int]:
     """Times on the law's clock [s], panels, and how many ticks two points of a line stand for; 1 for every tick.
 
@@ -74,7 +78,7 @@ def panels_of(
         quarter = np.maximum(0.0, ((last - first + 1) / 2 - 1) / 2)
         k = np.column_stack([first + quarter, last - quarter]).ravel()
     panels = list[Panel]()
-    for group, title, labels, unit, lines in _quantities(settings, ticks, theorem):
+    for group, title, labels, unit, lines in _quantities(settings, ticks, theorem, truths):
         for i, label in enumerate(labels):
             columns = {name: values.reshape(n, -1)[:, i] for name, values in lines.items()}
             drawn = [
@@ -97,7 +101,7 @@ def outline(values: Array, starts: Integers) -> Array:
     return np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
 
 
-def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iterator[_Quantity]:
+def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths: Truths) -> Iterator[_Quantity]:
     case, desired, error = case_of(settings), ticks.desired, ticks.attitude_error
 
     def title(name: str, quantity: str) -> str:
@@ -150,6 +154,9 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck) -> Iter
         yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", lines
         lines = {"measured, without θ̃": V, f"true, {'with' if theorem.damping_known else 'without'} θ̃": true(1)}
         yield "lyapunov", "Lyapunov function", ["V"], "N·m", lines
+    for signal, its in truths.signals.items():
+        lines = {"true": np.asarray(np.interp(ticks.k, truths.k, its, left=np.nan))}  # for drawing only
+        yield "signals", "The plant's own signals", [signal], "1", lines
 
 
 def _norm(ticks: Ticks, law: AdaptiveSettings) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from aeroloop.service.figures import Figures, figures
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, Session, Unknown
 from aeroloop.service.logs.ticks import Ticks, recompute
-from aeroloop.service.review.events import Messages, age_us, fault_intervals, happened, read_messages
+from aeroloop.service.review.events import Messages, Truths, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
 from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, flat
@@ -49,6 +49,7 @@ class Review:
     settings: Settings
     ticks: Ticks
     theorem: TheoremCheck
+    truths: Truths
     name: str
     facts: dict[str, dict[str, Any]]
     part: tuple[float, float] | None
@@ -59,7 +60,7 @@ class Review:
 
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
-        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points)
+        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points, self.truths)
         findings, settings = self.checked(limits), self.settings.description()
         return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
 
@@ -182,7 +183,9 @@ def read(
     path = paths[0].resolve()
     name = path.name if path.is_dir() else path.stem
     name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    return Review(merits, findings, settings, ticks, theorem, name, _facts(recording, its, messages), part)
+    return Review(
+        merits, findings, settings, ticks, theorem, messages.truths, name, _facts(recording, its, messages), part
+    )
 
 
 def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:

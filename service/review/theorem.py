@@ -25,8 +25,8 @@ from aeroloop.service.logs.ticks import Flags, Ticks
 from aeroloop.service.review.events import Truths, judged_ticks
 from aeroloop.service.review.observations import error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
-from aeroloop.service.theorem import lemma
-from aeroloop.service.theorem.any_law import promise
+from aeroloop.service.theorem import bounds as lemma
+from aeroloop.service.theorem.certificate import promise
 from aeroloop.service.theorem.feedback import Feedback
 from aeroloop.service.theorem.invariant import Premises, distance, reach
 

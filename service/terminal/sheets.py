@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from aeroloop.protocol.wire.spec import WireSpec
     from aeroloop.service.host.doctor import Diagnosis
     from aeroloop.service.host.keys import KeyFile
-    from aeroloop.service.theorem.any_law import OwnCertificate
-    from aeroloop.service.theorem.certificate import Certificate
+    from aeroloop.service.theorem.certificate import Certificate, OwnCertificate
 
 DECIDING: Final = (
     "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "‖w_q‖", "τ_h of the plant"
@@ -24,7 +23,7 @@ DECIDING: Final = (
 
 def certificate_sheets(certificate: Certificate | OwnCertificate, verbose: bool = False) -> Sheets:
     """A certificate, with all of its terms if verbose; of a user's law, what it says."""
-    from aeroloop.service.theorem.any_law import OwnCertificate
+    from aeroloop.service.theorem.certificate import OwnCertificate
 
     if isinstance(certificate, OwnCertificate):
         said = certificate.model_extra or {}

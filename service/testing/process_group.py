@@ -43,7 +43,7 @@ PRELOADED: Final = (
     "aeroloop.service.daemon.roles",
     "aeroloop.service.recording.recorder",
     "aeroloop.service.testing.process_group",
-    "aeroloop.service.theorem.any_law",
+    "aeroloop.service.theorem.certificate",
     "aeroloop.service.viewers.channels",
     "aeroloop.plant_emulator.hosts.can_node",
     "casadi",  # the modules above import it at its first use

@@ -1,29 +1,34 @@
 """Certificate: what is proven of a configuration, with its assumptions, and what fails.
 
-Of every law that `feedback` knows: a bound of the error at every instant, by `invariant`, for the paper's body and for
-the configured plant. The certificate holds if the plant's set is proven and lies within all that the proof presumes:
-the wire's ranges, the voltages within reach, half a turn, the bound of the damping. Of the paper's law also condition
-(C.66) with its terms, by `bounds`: a law in continuous time, so nothing of a sampled loop is concluded from it.
+A user's law may bring its own, `Law.certify`. Of every law that `feedback` knows: a bound of the error at every
+instant, by `invariant`, for the paper's body and for the configured plant. The certificate holds if the plant's set is
+proven and lies within all that the proof presumes: the wire's ranges, the voltages within reach, half a turn, the bound
+of the damping. Of the paper's law also condition (C.66) with its terms, by `bounds`: a law in continuous time, so
+nothing of a sampled loop is concluded from it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import asin, degrees, floor, hypot, inf, radians, sin, sqrt
 from typing import Any, Final, NamedTuple, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from aeroloop.protocol.messages.operator import Hold
+from aeroloop.protocol.messages.operator import Change, Hold, in_force
 from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.laws.registry import law_class, words_of
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
-from aeroloop.service.theorem.extremes import Extremes, chords, extremes, motors
-from aeroloop.service.theorem.feedback import feedback_of
+from aeroloop.service.theorem.extremes import BoundlessError, Extremes, chords, extremes, motors
+from aeroloop.service.theorem.feedback import NoTheoremError, feedback_of
 from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
 
@@ -50,15 +55,6 @@ class Certificate(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     holds: bool = Field(description="whether the bound at every instant is proven of the configured plant")
-    margin: float | None = Field(description="c₀/2 − δ_V1 [N·m·s/rad]; null, as the next six, of another law")
-    c0: float | None = Field(description="c₀, as corrected [N·m·s/rad]")
-    delta_V1: float | None = Field(description="δ_V1 of (C.67) [N·m·s/rad]")
-    delta_V2: float | None = Field(description="δ_V2 of (C.71) [N·m]")
-    delta_Q: float | None = Field(description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance [W]")
-    k: float | None = Field(description="the largest k of (C.66) [N·m·s/rad]; null where it fails")
-    radius: float | None = Field(
-        description="√(δ_Q/k) of (C.79): root of the mean of ‖z‖² in the long run, in continuous time; null as k"
-    )
     pointwise_radius: float | None = Field(
         description="bound of ‖z‖ at every instant, in the end, for the paper's body under this wire, law and period "
         "[1, rad/s]; null where none is proven"
@@ -98,6 +94,15 @@ class Certificate(BaseModel):
     def value(self, symbol: str) -> float | None:
         """The value of the term with this symbol. Raises KeyError if there is none."""
         return {term.symbol: term.value for term in self.terms}[symbol]
+
+
+class OwnCertificate(BaseModel):
+    """What a user's law says is proven of a configuration: `Law.certify`. It may have more than these."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    holds: bool
+    verdict: str
 
 
 class Paper(NamedTuple):
@@ -262,11 +267,8 @@ def certify(
     constant = (
         reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else e.plant_reach
     )
-    t = e.paper and e.paper.theorem
     return Certificate(
         holds=not violated,
-        **{name: getattr(t, name, None) for name in ("margin", "c0", "delta_V1", "delta_V2", "k", "radius")},
-        delta_Q=None if t is None else t.delta_Qdist,
         pointwise_radius=_radius(e.body_reach),
         pointwise_deg=_degrees(e.body_reach),
         plant_radius=_radius(e.plant_reach),
@@ -278,6 +280,76 @@ def certify(
         violated=violated,
         terms=[*(term for part in e.paper or () for term in _terms(part)), *_reach_terms(e.plant_reach)],
     )
+
+
+def certificate_of(settings: Settings, **options: Any) -> Certificate | OwnCertificate:
+    """The certificate of a configuration, whatever its law.
+
+    Args:
+        settings: The configuration.
+        options: As `certify` takes them, for the paper's law.
+
+    Raises:
+        NoTheoremError: The law has none, or its own `certify` fails; one line that names it.
+        BoundlessError: The reference has no bounds.
+        PluginError: There is no such law.
+    """
+    law, kind = law_class(settings.law), settings.law.kind
+    try:
+        own = law.certify(settings)
+        if own is not None:
+            return OwnCertificate.model_validate(own)
+    except ValidationError as error:
+        raise NoTheoremError(f"the certificate of law {kind} is none: {problem(error, OwnCertificate)}") from None
+    except Exception as error:
+        raise NoTheoremError(f"no certificate: {words_of(kind, error, law.certify)}") from None
+    return certify(settings, **options)
+
+
+def described_certificate(settings: Settings) -> dict[str, Any] | None:
+    """The certificate as a controller's description carries it; None of a stream, or of a law without a theorem."""
+    try:
+        return certificate_of(settings).model_dump(mode="json")
+    except (NoTheoremError, BoundlessError):
+        return None
+
+
+class Promise(NamedTuple):
+    """The law with the gains in force, its certificate, what that is made of, and the verdict in a sentence.
+
+    Of a law without a theorem, or a reference without bounds, only the law and the verdict are known.
+    """
+
+    law: LawSettings
+    certificate: Certificate | None
+    bounds: Evaluated | None
+    verdict: str
+
+
+def promise(settings: Settings, changes: Sequence[Change] = (), described: Mapping[str, Any] | None = None) -> Promise:
+    """What is promised with these changes of gains and reference in force.
+
+    `described` is the certificate in the controller's description: it counts if both are as configured.
+    """
+    law, reference = settings.law, settings.reference
+    for change in in_force(changes):
+        reference = change.reference or reference
+        if change.gains is not None:
+            law = law.model_copy(update=change.gains.named)
+    begun = settings.model_copy(update={"law": law, "reference": reference})
+    try:
+        bounds = evaluate(begun)
+    except NoTheoremError as error:
+        text = str(error)
+        return Promise(law, None, None, (described or {}).get("verdict", f"{text[0].upper()}{text[1:]}."))
+    except BoundlessError as error:
+        return Promise(law, None, None, f"Nothing is promised: {error}.")
+    certificate = None
+    if (law, reference) == (settings.law, settings.reference) and described is not None:
+        with suppress(ValidationError):  # of another version
+            certificate = Certificate.model_validate(described)
+    certificate = certificate or certify(begun)
+    return Promise(law, certificate, bounds, certificate.verdict)
 
 
 def _largest_delay(settings: Settings, e: Evaluated) -> float:

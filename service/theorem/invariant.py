@@ -19,8 +19,8 @@ import numpy as np
 
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.reference import Floats
+from aeroloop.service.theorem.bounds import Coordinates, norm
 from aeroloop.service.theorem.feedback import Feedback
-from aeroloop.service.theorem.lemma import Coordinates, norm
 from aeroloop.service.theorem.linear import Axis, Responses, responses
 from aeroloop.service.theorem.plant_bounds import NO_ENCODER, EncoderRate
 

@@ -113,6 +113,7 @@ def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(h
     hil.eventually("tripped", lambda: hil.state("plant") == "tripped")
     stopped = f"stopped by an operator ({getpass.getuser()}@{socket.gethostname()}): 0 V"
     assert hil.status("plant").cause == stopped
+    hil.eventually("refused", lambda: "`aeroloop op arm` clears it" in refused(hil, "goto", "0", "0", "0"))
     since = hil.status("plant").since
     assert since is not None
     assert f"{stopped} ({since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" in done(hil, "status")

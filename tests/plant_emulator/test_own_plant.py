@@ -41,13 +41,17 @@ def test_a_class_is_made_with_its_own_settings_and_the_period() -> None:
     [
         ("areo", {}, "plant.kind = 'areo' is not known: it is one of aero, fmu, mujoco, rigid_body, or package"),
         ("nowhere:Table", {}, "there is no module nowhere here"),
-        (f"{HERE}:Tabel", {}, "has no Tabel; its classes are"),
+        (f"{HERE}:Tabel", {}, "has no Tabel; its classes of aeroloop.Plant are Turntable, "),
         (f"{HERE}:NoPlant", {}, "does not derive from aeroloop.Plant"),
         (f"{HERE}:Unfinished", {}, "Unfinished"),
         (TABLE, {"inertai": 1}, "unknown key plant.own.inertai: did you mean plant.own.inertia?"),
         (TABLE, {"inertia": -1}, "plant.own.inertia: should be greater than 0, not -1"),
         (TABLE, {"fails_in": "__init__"}, "Turntable (plant.kind) raised RuntimeError: no such table (own_plants.py"),
-        (f"{HERE}:Legless", {}, "Legless has actuators = 0, which must be a whole number from 1 to 8"),
+        (
+            f"{HERE}:Legless",
+            {},
+            "Legless has actuators = 0, which must be a whole number from 1 to 8 (own_plants.py, line ",
+        ),
     ],
 )
 def test_what_is_no_plant_is_one_line(kind: str, own: dict[str, Any], line: str) -> None:
@@ -64,6 +68,24 @@ def test_its_own_exception_is_one_line_with_class_file_and_line(method: str) -> 
         plant.actuate((1.0,)) if method == "actuate" else getattr(plant, method)()
     text = f"Turntable failed in {method}(): RuntimeError: the table broke in {method} (own_plants.py, line "
     assert str(caught.value).startswith(text)
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [
+        {"two words": 1.0},
+        {"": 1.0},
+        {"α_rad": 1.0},
+        {"a" * 41: 1.0},
+        {"state": "off"},
+        [1.0],
+        {f"n{i}": i for i in range(17)},
+    ],
+)
+def test_signals_that_no_log_would_hold_are_refused(signals: Any) -> None:
+    plant, _ = table(signals=signals)
+    with pytest.raises(PlantError, match=r"Turntable gave .*: truth\(\) must return State"):
+        plant.truth()
 
 
 def test_after_a_failure_it_is_closed_once_and_the_first_failure_stays_the_one_shown() -> None:

@@ -19,9 +19,9 @@ from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import SessionReplay, replay
 from aeroloop.service.review.review import read, review
-from aeroloop.service.theorem.certificate import Certificate, certify
+from aeroloop.service.theorem.certificate import certify
 from tests.support.certified import certified_settings
-from tests.support.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+from tests.support.made_log import lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
 OTHERS = [kind for kind in get_args(Kind) if kind != "uniform"]
@@ -34,10 +34,6 @@ other_kinds = pytest.mark.parametrize("kind", OTHERS)
 def throughout(kind: str, *more: str) -> Settings:
     """The paper's experiment in lockstep with this kind for all signals."""
     return load_over(lockstep(), [*(f"wire.{signal}.kind={kind}" for signal in SIGNALS), *more])
-
-
-def certificate(settings: Settings) -> Certificate:
-    return certify(settings)
 
 
 def replayed(path: Path) -> SessionReplay:
@@ -82,13 +78,6 @@ def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str) -> Non
 # ── the log ──
 
 
-@every_kind
-def test_every_command_of_a_log_is_computed_again_byte_for_byte(kind: str, tmp_path: Path) -> None:
-    make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind), changes=AN_OPERATORS_WORDS)
-    session = replayed(tmp_path / "a.mcap")
-    assert (session.first_tick, session.ticks, session.differ) == (0, TICKS, 0)
-
-
 @other_kinds
 @pytest.mark.parametrize("begin", [7, 123, 305])
 def test_a_log_that_begins_in_the_middle_is_replayed_with_what_was_held_then(
@@ -104,32 +93,26 @@ def test_a_log_that_begins_in_the_middle_is_replayed_with_what_was_held_then(
 
 
 @every_kind
-def test_the_figures_of_a_log_are_those_of_the_experiment(kind: str, tmp_path: Path) -> None:
+def test_a_log_is_computed_again_byte_for_byte_and_has_the_figures_of_the_experiment(kind: str, tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind))
+    session = replayed(tmp_path / "a.mcap")
+    assert (session.first_tick, session.ticks, session.differ) == (0, TICKS, 0)
     figures, expected = review(tmp_path / "a.mcap"), run_experiment(throughout(kind), TICKS * 0.002)
     assert (figures.z_track, figures.u_total) == (expected.z_track, expected.u_total)
     assert figures.damages == []
 
 
 @other_kinds
-def test_a_level_that_saturates_is_counted_in_the_log(kind: str, tmp_path: Path) -> None:
-    make_log(tmp_path / "a.mcap", 200, settings=throughout(kind, "wire.voltage.limit=2"))
-    shares = read(tmp_path / "a.mcap").findings.saturated
-    assert 0 < shares["voltage"] < 1
-    assert shares["attitude"] == 0
-
-
-@other_kinds
-def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, tmp_path: Path) -> None:
+def test_review_and_export_have_the_levels_that_were_sent_and_which_saturated(kind: str, tmp_path: Path) -> None:
     log, out = tmp_path / "a.mcap", tmp_path / "a.parquet"
     settings = throughout(kind, "wire.voltage.limit=2")
     make_log(log, 200, settings=settings)
+    shares = read(log).findings.saturated
+    assert 0 < shares["voltage"] < 1
+    assert shares["attitude"] == 0
     export([log], "parquet", out)
-    table, wire, quantizer = (
-        pyarrow.parquet.read_table(out).to_pydict(),
-        settings.wire,
-        settings.wire.voltage.quantizer(),
-    )
+    table, wire = pyarrow.parquet.read_table(out).to_pydict(), settings.wire
+    quantizer = wire.voltage.quantizer()
     rows = Recording([log]).session(("aero", "s1")).controller
     sent = [wire.command.unpack(frame.tobytes()) for frame in rows["command"]]
     codes = [frame[1] for frame in sent if frame is not None]
@@ -148,14 +131,14 @@ def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, 
 @every_kind
 def test_the_certificate_takes_the_bound_of_each_kind(kind: str) -> None:
     settings = certified_settings(12, 12, *(f"wire.{signal}.kind={kind}" for signal in SIGNALS))
-    found, wire = certificate(settings), settings.wire
+    found, wire = certify(settings), settings.wire
     assert found.holds
     for symbol, signal, elements in (("‖δ_ε‖", wire.attitude, 3), ("‖δ_ω‖", wire.rate, 3), ("‖δ_u‖", wire.voltage, 3)):
         assert found.value(symbol) == sqrt(elements) * signal.quantizer().bound
 
 
 def test_what_errs_by_more_promises_less() -> None:
-    found = [certificate(throughout(kind, *(f"wire.{s}.bits=12" for s in SIGNALS))) for kind in get_args(Kind)]
+    found = [certify(throughout(kind, *(f"wire.{s}.bits=12" for s in SIGNALS))) for kind in get_args(Kind)]
     for symbol in ("δ_Qdist", "δ_V1"):
         uniform, *others = (each.value(symbol) or 0.0 for each in found)
         assert 0 < uniform < min(others)

@@ -101,6 +101,9 @@ MESSAGES: list[Message] = [
         voltages=(12.5, -24.0),
     ),
     Truth(tick=0, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0, -0.5, 0.1), voltages=(0.0, 24.0, 3.0)),
+    Truth(
+        tick=0, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0,) * 3, voltages=(), signals={"battery_V": 24.1, "T_deg": None}
+    ),
     Timing(wake=LATENCY, busy=LATENCY, period=LATENCY, recent_wake=LATENCY, recent_busy=None, recent_period=None),
     Event(role="plant", kind="tripped", text="no fresh command for 100 ms", session="5f0c", tick=1207),
     Loss(key="aeroloop/aero/5f0c/command", count=3, reason="gone"),

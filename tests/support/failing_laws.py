@@ -56,25 +56,39 @@ class Failing(PythonLaw[FailingSettings]):
         return [1.0] * self.actuators
 
 
-class WrongWidth(ExpressionLaw[LawSettings]):
-    """One voltage, whatever the number of motors."""
-
-    Settings = LawSettings
-
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        return now.rate_error[0], {}
+Mistake = Literal["width", "state", "one value", "iterates", "no such setting", "no such vector", "initial"]
 
 
-class WrongState(ExpressionLaw[LawSettings]):
-    """A state that is not as long as its first one."""
+class MistakenSettings(LawSettings):
+    """Which of a beginner's mistakes is made."""
 
-    Settings = LawSettings
+    mistake: Mistake = Field(description="what is wrong with it")
+
+
+class Mistaken(ExpressionLaw[MistakenSettings]):
+    """Expressions that cannot be built."""
+
+    Settings = MistakenSettings
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        return {"sum": (0.0, 0.0)}
+        return {"sum": 0.0 if self.settings.mistake == "initial" else (0.0, 0.0)}  # type: ignore[dict-item]
 
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        return now.rate_error[3 - self.actuators :], {"sum": now.rate_error}
+    def expressions(self, now: Now[ca.SX]) -> Any:
+        zero = ca.SX.zeros(self.actuators)
+        match self.settings.mistake:
+            case "width":
+                return now.rate_error[0], now.state
+            case "state":
+                return zero, {"sum": now.rate_error}
+            case "one value":
+                return zero
+            case "iterates":
+                _x, _y, _z = now.rate  # iterates
+            case "no such setting":
+                return self.settings.kz * zero, now.state  # type: ignore[attr-defined]  # no such setting
+            case "no such vector":
+                return now.speed, now.state  # type: ignore[attr-defined]  # no such vector
+        return zero, now.state
 
 
 class Picky(PythonLaw[LawSettings]):
@@ -110,6 +124,12 @@ class Runaway(ExpressionLaw[LawSettings]):
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
+
+
+class NoSuchGain(Runaway):
+    """Names a gain that its settings do not have."""
+
+    gains = ("kz",)
 
 
 class FourthTick(PythonLaw[LawSettings]):

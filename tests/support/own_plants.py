@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, nan, sin
+from math import cos, degrees, nan, sin
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, Field
@@ -21,6 +21,7 @@ class TurntableSettings(BaseModel, extra="forbid"):
     fails_after: int = Field(default=3, description="periods before it fails")
     gives: Literal["values", "nan", "few", "long", "nothing"] = "values"
     says: Any = None
+    signals: Any = None
 
 
 class Turntable(Plant):
@@ -68,7 +69,8 @@ class Turntable(Plant):
     def truth(self) -> State | None:
         self._may("truth")
         rate: Vector = (0.0, 0.0, self._rate)
-        return State((cos(self._angle / 2), 0.0, 0.0, sin(self._angle / 2)), rate, self.volts)
+        signals = self._own.signals or {"angle_deg": degrees(self._angle), "battery_V": nan}
+        return State((cos(self._angle / 2), 0.0, 0.0, sin(self._angle / 2)), rate, self.volts, signals)
 
     def close(self) -> None:
         self.closed += 1

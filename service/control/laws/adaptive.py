@@ -78,18 +78,7 @@ class Equations:
     theta_dot: ca.SX
 
 
-_SIZES: Final = {
-    "q": 4,
-    "omega": 3,
-    "q_d": 4,
-    "omega_d": 3,
-    "omega_d_dot": 3,
-    "theta": 3,
-    "s": 1,
-    "C1": 3,
-    "C2": 3,
-    "Gamma": 3,
-}
+_GIVEN: Final = ("q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C1", "C2", "Gamma")
 
 
 def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX] | None = None) -> Equations:
@@ -104,8 +93,8 @@ def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX
         ValueError: B cannot be inverted, or does not fit so many actuators.
     """
     check_allocation(p, actuators)
-    given = given or {name: ca.SX.sym(name, size) for name, size in _SIZES.items()}
-    q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains = (given[name] for name in _SIZES)
+    given = given or {name: ca.SX.sym(name, {"q": 4, "q_d": 4, "s": 1}.get(name, 3)) for name in _GIVEN}
+    q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains = (given[name] for name in _GIVEN)
     C1, C2, Gamma = (ca.diag(gain) for gain in gains)
     J = ca.diag(ca.SX(p.inertia))
     I = ca.SX.eye(3)  # noqa: E741  # the paper's identity matrix
@@ -176,7 +165,7 @@ class Adaptive(ExpressionLaw[AdaptiveSettings]):
         theta, s, bound = now.state["damping_estimate"], now.state["sign"], self.settings.damping_bound
         s = s + (s == 0) * (2 * (now.attitude_error[0] >= 0) - 1)
         motion = now.attitude, now.rate, now.desired_attitude, now.desired_rate, now.desired_acceleration
-        given = dict(zip(_SIZES, (*motion, theta, s, *(now.gains[name] for name in self.gains)), strict=True))
+        given = dict(zip(_GIVEN, (*motion, theta, s, *(now.gains[name] for name in self.gains)), strict=True))
         law = equations(self.settings, self.actuators, given)
         theta_next = theta + self.period * law.theta_dot
         # Euler's step leaves the outer ball along its tangent; the projection keeps θ̂ within in continuous time only.

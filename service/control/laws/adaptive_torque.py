@@ -24,7 +24,7 @@ For equal k₁ and with θ̃ = θ − θ̂, the paper's Lyapunov function plus o
     V = 2k₁(1 ∓ η̃) + ½ z₂ᵀJz₂ + ½ θ̃ᵀΓ⁻¹θ̃,
     V̇ ≤ −k₁ ε̃ᵀC₁ε̃ − z₂ᵀ(C₂ + diag(θ_v − θ̂_v(t₀)))z₂ − z₂ᵀdiag(θ_c)(tanh(ω/ε) − tanh(ω_r/ε)) + θ̃ᵀΓ⁻¹θ̇
 
-whose third term is never positive, because tanh rises and ω − ω_r = z₂. README.md derives it.
+whose third term is never positive, because tanh rises and ω − ω_r = z₂. service/theorem/README.md derives it.
 
 Proj keeps each element of θ̂ within a bound of its first value, and friction from being negative. While a motor
 saturates friction is not learned, and θ̂_d gives way to what the motors lack, as the PID's integral does.

@@ -11,6 +11,7 @@ import numpy as np
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, Now, PythonLaw
+from aeroloop.service.control.laws.registry import naming
 
 
 def received(eps: ca.SX, last: ca.SX) -> ca.SX:
@@ -45,7 +46,7 @@ def law_function(law: Law[Any]) -> ca.Function:
     Outputs: q, u, state_next, eta_e, eps_e, omega_e.
 
     Raises:
-        ValueError: The law gives another number of voltages, or another state than its first one.
+        LawError: The law fails, gives another number of voltages, or another state than its first one.
     """
     states = {name: len(value) for name, value in initial_state(law).items()}
     gains = {name: len(value) for name, value in configured_gains(law).items()}
@@ -60,7 +61,8 @@ def law_function(law: Law[Any]) -> ca.Function:
     given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
     if isinstance(law, ExpressionLaw):
         now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, split(gain, gains), split(state, states))
-        answer = ca.Function("answer", seen, _expressions(law, now, states), {"cse": True})
+        with naming(law.settings.kind, law.expressions):
+            answer = ca.Function("answer", seen, _expressions(law, now, states), {"cse": True})
     else:
         of_law = ca.SX.sym("law_voltages", law.actuators), ca.SX.sym("law_state", sizes["state"])
         given |= dict(zip(("law_voltages", "law_state"), of_law, strict=True))
@@ -81,35 +83,48 @@ def law_function(law: Law[Any]) -> ca.Function:
 
 def _expressions(law: ExpressionLaw[Any], now: Now[ca.SX], states: Mapping[str, int]) -> list[ca.SX]:
     """Voltages and next state of a law, each in one column; `states` are the sizes of its first state."""
-    voltages, after = law.expressions(now)
-    u = ca.densify(ca.vec(ca.SX(voltages)))
-    check_voltages(law, u.numel())
-    found = {name: ca.vec(ca.SX(value)) for name, value in after.items()}
-    if {name: value.numel() for name, value in found.items()} != states:
-        raise ValueError(f"its state after a tick is not that of `initial`: {', '.join(states) or 'none'}")
+    answer = law.expressions(now)
+    if not (isinstance(answer, tuple) and len(answer) == 2):
+        raise TypeError("it gives one value, not two: the voltages, and the state after this tick, such as {}")
+    u = ca.densify(ca.vec(ca.SX(answer[0])))
+    found = {name: ca.vec(ca.SX(value)) for name, value in answer[1].items()}
+    check_answer(law, u.numel(), {name: value.numel() for name, value in found.items()}, states)
     return [u, ca.densify(ca.vertcat(ca.SX(0, 1), *(found[name] for name in states)))]
 
 
-def check_voltages(law: Law[Any], voltages: int) -> None:
-    """Raise ValueError if a law gives another number of voltages than there are actuators."""
+def check_answer(law: Law[Any], voltages: int, after: Mapping[str, int], first: Mapping[str, int]) -> None:
+    """Raise ValueError if a law gives other than one voltage for each actuator, or another state than its first one.
+
+    Args:
+        law: The law.
+        voltages: How many it has given.
+        after: Sizes of the state that it has given, by name.
+        first: The same of its first state.
+    """
     if voltages != law.actuators:
         raise ValueError(f"it gives {voltages} voltages for {law.actuators} actuators")
+    if dict(after) != dict(first):
+        found, known = (", ".join(f"{n} of {size}" for n, size in sizes.items()) or "none" for sizes in (after, first))
+        raise ValueError(f"its state after a tick is {found}, and its first state is {known}")
 
 
 def configured_gains(law: Law[Any]) -> dict[str, tuple[float, ...]]:
-    """The gains of a law's settings, by name."""
-    values = {name: getattr(law.settings, name) for name in law.gains}
+    """The gains of a law's settings, by name. Raises LawError for a gain that its settings do not have."""
+    with naming(law.settings.kind, type(law)):
+        values = {name: getattr(law.settings, name) for name in law.gains}
     return {name: tuple(value) if isinstance(value, Sequence) else (value,) for name, value in values.items()}
 
 
 def initial_state(law: Law[Any]) -> dict[str, list[float]]:
-    """The named state before the first tick."""
+    """The named state before the first tick. Raises LawError if the law fails."""
     if isinstance(law, PythonLaw):
-        law.state = {}
-        law.reset()
-        return {name: np.asarray(values, dtype=np.float64).ravel().tolist() for name, values in law.state.items()}
+        with naming(law.settings.kind, law.reset):
+            law.state = {}
+            law.reset()
+            return {name: np.asarray(values, dtype=np.float64).ravel().tolist() for name, values in law.state.items()}
     assert isinstance(law, ExpressionLaw)
-    return {name: list(map(float, values)) for name, values in law.initial().items()}
+    with naming(law.settings.kind, law.initial):
+        return {name: list(map(float, values)) for name, values in law.initial().items()}
 
 
 def split(column: ca.SX, sizes: Mapping[str, int]) -> dict[str, ca.SX]:

@@ -59,8 +59,8 @@ class LawSettings(BaseModel):
     )
     allocation: tuple[Row, Row, Row] = Field(
         default=((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, -0.0014, 0.00176)),
-        description="B, control allocation of rank 3, a column for each motor [N·m/V]; the Aero's first row and column "
-        "are fictitious",
+        description="B, control allocation of rank 3, a column for each motor: voltages u turn the body with "
+        "the torque +B u, body frame [N·m/V]; the Aero's first row and column are fictitious",
     )
 
 
@@ -84,12 +84,15 @@ class Now(NamedTuple, Generic[X]):
     Attributes:
         attitude: q, body relative to inertial, as received; scalar part first [1]. Shape (4,).
         rate: ω as received, body frame [rad/s]. Shape (3,).
-        desired_attitude: q_d [1]. Shape (4,).
-        desired_rate: ω_d, *inertial* frame [rad/s]. Shape (3,).
+        desired_attitude: q_d, relative to inertial [1]. Shape (4,).
+        desired_rate: ω_d, *inertial* frame: R(q)ᵀω_d is in the body frame [rad/s]. Shape (3,).
         desired_acceleration: Its derivative, inertial frame [rad/s²]. Shape (3,).
-        attitude_error: e = q_d⁻¹ ∘ q, (C.16): from desired to received; ±e are the same attitude [1]. Shape (4,).
-        rate_error: ω − R(q)ᵀω_d, (C.18), body frame [rad/s]. Shape (3,).
-        gains: The present value of each of `Law.gains`, by name. Shape (1,) for a number, else its length.
+        attitude_error: e = q_d⁻¹ ∘ q, (C.16), the body relative to the desired frame: R(e) = R(q_d)ᵀR(q), and [1, 0, 0,
+            0] without error. A torque along −e[1:4] turns back the shorter way if e[0] ≥ 0; −e is the same attitude
+            [1]. Shape (4,).
+        rate_error: ω − R(q)ᵀω_d, (C.18), *body* frame [rad/s]. Shape (3,).
+        gains: The present value of each of `Law.gains`, by name, which an operator may have changed: `Law.settings` has
+            the configured one. Shape (1,) for a number, else its length.
         state: The named state after the last tick. Each in the shape that the law gave it.
     """
 
@@ -108,7 +111,7 @@ class Law(ABC, Generic[T]):
     """A control law. Derive from `ExpressionLaw` or `PythonLaw`.
 
     Args:
-        settings: An instance of the class's `Settings`.
+        settings: An instance of the class's `Settings`, as configured. A gain's present value is in `Now.gains`.
         period: Time between ticks [s].
         actuators: Number of voltages to give.
 
@@ -177,11 +180,11 @@ class PythonLaw(Law[T]):
 def gravity_torque(p: LawSettings, q: X) -> X:
     """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,).
 
-    Of an expression it is an expression, of an array an array.
+    It acts on the body, so a law that cancels it subtracts it. Of a CasADi expression it is one, of numbers an array.
     """
     weight = ca.vertcat(0, 0, -p.mass * p.gravity)
     torque = S(ca.SX(p.centre_of_mass)) @ R(ca.SX(cast(Any, q))).T @ weight
-    return cast(X, np.asarray(ca.evalf(torque)).ravel() if isinstance(q, np.ndarray) else torque)
+    return cast(X, torque if isinstance(q, ca.SX) else np.asarray(ca.evalf(torque)).ravel())
 
 
 def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
@@ -191,15 +194,15 @@ def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
 
     Args:
         p: Has B.
-        torque: Body frame, an expression or an array [N·m]. Shape (3,).
+        torque: B u on the body, body frame: an expression, or numbers, which give an array [N·m]. Shape (3,).
         actuators: Number of motors.
 
     Raises:
         ValueError: B has no inverse, or another number of columns.
     """
     B: Floats = check_allocation(p, actuators)
-    if isinstance(torque, np.ndarray):
-        return (np.linalg.pinv(B) @ torque)[-actuators:]
+    if not isinstance(torque, ca.SX):
+        return (np.linalg.pinv(B) @ np.asarray(torque, dtype=np.float64))[-actuators:]
     if B.shape == (3, 3):
         return ca.solve(ca.SX(B), torque)[3 - actuators :]
     return ca.mtimes(ca.SX(np.linalg.pinv(B)), torque)

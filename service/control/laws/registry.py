@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, Final, Union
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, create_model
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Gains
-from aeroloop.protocol.plugins import PluginError, exception_line, find, source_of
+from aeroloop.protocol.plugins import PluginError, exception_line, find, place_of, source_of
 from aeroloop.protocol.wording import problems
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
-from aeroloop.service.control.laws.baselines import (
-    LQRSettings,
-    NonadaptiveSettings,
-    PDSettings,
-    PIDSettings,
-    SlidingSettings,
-)
+from aeroloop.service.control.laws.adaptive import Adaptive
+from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorque
+from aeroloop.service.control.laws.baselines import LQR, PD, PID, Nonadaptive, Sliding
 from aeroloop.service.control.laws.interface import Law, LawSettings
 
 GROUP: Final = "aeroloop.laws"
-_LAWS: Final = "aeroloop.service.control.laws"
-BUILT_IN: Final = {
-    "adaptive": f"{_LAWS}.adaptive:Adaptive",
-    "nonadaptive": f"{_LAWS}.baselines:Nonadaptive",
-    "pd": f"{_LAWS}.baselines:PD",
-    "pid": f"{_LAWS}.baselines:PID",
-    "adaptive-torque": f"{_LAWS}.adaptive_torque:AdaptiveTorque",
-    "sliding": f"{_LAWS}.baselines:Sliding",
-    "lqr": f"{_LAWS}.baselines:LQR",
-}
 _OWN: Final = "package.module:Class"
+_OURS: Final[tuple[type[Law[Any]], ...]] = Adaptive, Nonadaptive, PD, PID, AdaptiveTorque, Sliding, LQR
 
 
 class OwnLawSettings(LawSettings):
@@ -41,41 +28,26 @@ class OwnLawSettings(LawSettings):
     model_config = ConfigDict(extra="allow")
 
 
+MODELS: Final = {law.Settings.model_fields["kind"].default: law.Settings for law in _OURS} | {_OWN: OwnLawSettings}
+"""The model of each kind of `[law]`."""
+BUILT_IN: Final = {kind: f"{law.__module__}:{law.__name__}" for kind, law in zip(MODELS, _OURS, strict=False)}
+
+
 def _tag(section: Any) -> str:
     kind = section.get("kind", "adaptive") if isinstance(section, dict) else getattr(section, "kind", "")
     return kind if isinstance(kind, str) and kind in BUILT_IN else _OWN
 
 
-MODELS: Final = {
-    "adaptive": AdaptiveSettings,
-    "nonadaptive": NonadaptiveSettings,
-    "pd": PDSettings,
-    "pid": PIDSettings,
-    "adaptive-torque": AdaptiveTorqueSettings,
-    "sliding": SlidingSettings,
-    "lqr": LQRSettings,
-    _OWN: OwnLawSettings,
-}
-
-LawSection = Annotated[
-    Annotated[AdaptiveSettings, Tag("adaptive")]
-    | Annotated[NonadaptiveSettings, Tag("nonadaptive")]
-    | Annotated[PDSettings, Tag("pd")]
-    | Annotated[PIDSettings, Tag("pid")]
-    | Annotated[AdaptiveTorqueSettings, Tag("adaptive-torque")]
-    | Annotated[SlidingSettings, Tag("sliding")]
-    | Annotated[LQRSettings, Tag("lqr")]
-    | Annotated[OwnLawSettings, Tag(_OWN)],
-    Discriminator(_tag),
-    Field(
-        json_schema_extra={
-            "discriminator": {
-                "propertyName": "kind",
-                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in MODELS.items()},
-            }
-        }
-    ),
-]
+_MAPPING: Final = {kind: f"#/$defs/{model.__name__}" for kind, model in MODELS.items()}
+if TYPE_CHECKING:
+    LawSection = LawSettings
+else:
+    LawSection = Annotated[
+        Union[tuple(Annotated[model, Tag(kind)] for kind, model in MODELS.items())],  # noqa: UP007  # of a table
+        Discriminator(_tag),
+        Field(json_schema_extra={"discriminator": {"propertyName": "kind", "mapping": _MAPPING}}),
+    ]
+    """`[law]`: the model of the kind that it names."""
 
 
 class LawError(AeroloopError):
@@ -134,24 +106,33 @@ def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
         LawError: The settings are wrong, or it is no law for so many actuators.
     """
     law, settings = _class_and_settings(section)
-    try:
+    with naming(section.kind, law):
         return law(settings, period, actuators)
-    except Exception as error:
-        raise LawError(words_of(section.kind, error)) from None
 
 
-def words_of(kind: str, error: Exception) -> str:
-    """What a law of this kind raised, in one line."""
+@contextmanager
+def naming(kind: str, called: Any) -> Iterator[None]:
+    """Raise what the law of this kind raises as LawError; `called` is the function or class of it that runs."""
+    try:
+        yield
+    except Exception as error:  # a user's code may raise anything
+        raise LawError(words_of(kind, error, called)) from None
+
+
+def words_of(kind: str, error: Exception, called: Any) -> str:
+    """What a law of this kind raised in one line, with file and line of a user's: there, or where `called` begins."""
     if kind in BUILT_IN:
         return str(error)
-    return f"law {kind}: {exception_line(error)}"
+    return f"law {kind}: {exception_line(error, called)}"
 
 
 def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettings]:
     law = law_class(section)
     model = getattr(law, "Settings", None)
     if not (isinstance(model, type) and issubclass(model, LawSettings)):
-        raise PluginError(f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings")
+        raise PluginError(
+            f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
+        )
     if isinstance(section, model):
         return law, section
     return law, _valid(model, section.model_dump())

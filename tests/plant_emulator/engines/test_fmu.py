@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from aeroloop.plant_emulator.engines.fmu import FmuError, FmuPlant, FmuSettings, body_rate, quaternion_of
 from aeroloop.plant_emulator.model.wind import WindSettings
-from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.service.config import load, with_bits
 from aeroloop.service.lab.experiment import experiment, run_experiment
@@ -105,12 +105,12 @@ def test_voltages_are_zero_at_first_and_go_where_their_names_say(fmus: dict[str,
     started, still = (FmuPlant(settings_of(fmus["fmi2"], start=start), PERIOD) for start in ({"u2": 5.0}, {}))
     for plant in (started, still):
         plant.advance()
-    assert started.truth() == still.truth() == (*still.measure(), (0.0, 0.0))
+    assert started.truth() == still.truth() == State(*still.measure(), (0.0, 0.0))
     swapped = FmuPlant(settings_of(fmus["fmi2"], voltages=["u3", "u2"]), PERIOD)
     straight = FmuPlant(settings_of(fmus["fmi2"]), PERIOD)
     assert driven(swapped, [(b, a) for a, b in WOBBLE]) == driven(straight, WOBBLE)
     still.actuate((3.0, -2.0))
-    assert still.truth() == (*still.measure(), (3.0, -2.0))
+    assert still.truth() == State(*still.measure(), (3.0, -2.0))
     for plant in (started, still):
         plant.close()
 

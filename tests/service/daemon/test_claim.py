@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import STATUS_VALUES, Grant, SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Gains, Hold
+from aeroloop.protocol.messages.models import STATUS_VALUES, Grant, Refusal, SessionRecord, Status
+from aeroloop.protocol.messages.operator import Answer, Gains, Hold, Message
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon import claim
@@ -68,13 +68,32 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
 class Plant:
     """A Zenoh session on which a plant answers, or none."""
 
-    def __init__(self, status: bytes | None) -> None:
-        self._answers = {} if status is None else {"status": status, "claim": Grant(session="s").encode()}
+    def __init__(self, status: bytes | None, claim: Message | None = None) -> None:
+        answer = (claim or Grant(session="s")).encode()
+        self._answers = {} if status is None else {"status": status, "claim": answer}
 
     def get(self, key: str, **_: object) -> list[SimpleNamespace]:
         """What the plant answers."""
         answers = [answer for topic, answer in self._answers.items() if f"/{topic}" in key]
         return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers]
+
+
+def test_a_refusal_is_an_event_once_and_stays_known_until_a_grant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an operator's request can be answered with it: "stopped; `op arm` clears it"."""
+    link, events = SimpleNamespace(close=lambda: None), list[str]()
+    monkeypatch.setattr(claim, "ZenohLink", lambda *_, **__: link)
+    zenoh = Plant(b"", Refusal(reason="stopped"))
+    role = SimpleNamespace(
+        zenoh=zenoh, vehicle="aero", name="c", datagrams=SimpleNamespace(wanted=False),
+        event=lambda _kind, text, _session: events.append(text),
+    )  # fmt: skip
+    claims = ClaimClient(cast(Node, role), LoopSettings(), WireSpec(), auto_arm=False)
+    for _ in range(3):
+        assert claims.claim() is None
+        assert (claims.refusal, events) == ("stopped", ["aero refuses: stopped"])
+    role.zenoh = Plant(b"")
+    assert claims.claim() is not None
+    assert claims.refusal == ""
 
 
 def _bytes(payload: bytes) -> SimpleNamespace:

@@ -130,6 +130,19 @@ def test_a_reference_holds_from_the_tick_that_is_published_and_arrives(
     assert loop.controller.desired == there.desired
 
 
+@pytest.mark.parametrize("reference", [yaw_of(30.0), THREE_POINTS, Sinusoid(amplitude=(0.0, 0.0, 30.0))])
+def test_without_a_time_a_reference_is_reached_in_the_shortest_that_is_not_refused(reference: Reference) -> None:
+    def ask(within_s: float | None) -> tuple[bool, float]:
+        loop = Loop(LEVEL)
+        loop.begin()
+        return loop.answered("track", Track(reference=reference, within_s=within_s)).done, loop.changes()[-1].within_s
+
+    done, shortest = ask(None)
+    assert done
+    assert ask(shortest * (1 + 1e-9))[0]
+    assert not ask(shortest * (1 - 1e-6))[0]
+
+
 @pytest.mark.parametrize("reference", [Hold(attitude=None), Stream()])
 def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop, reference: Reference) -> None:
     loop.ask("track", Track(reference=Sinusoid(amplitude=(0.0, 0.0, 20.0), frequency=(0.0, 0.0, 0.4)), within_s=0.5))
@@ -191,7 +204,7 @@ steps: st.SearchStrategy[tuple[str, Any]] = st.one_of(
     ticks,
     ticks,
     st.tuples(st.just("set_gains"), gains),
-    st.tuples(st.just("track"), st.builds(Track, reference=anything, within_s=within)),
+    st.tuples(st.just("track"), st.builds(Track, reference=anything, within_s=within | st.none())),
     st.tuples(st.just("set-points"), st.lists(attitudes, min_size=1, max_size=3)),
     st.tuples(st.just("time"), st.sampled_from([0.1, 1.0])),
     st.tuples(st.sampled_from(["no valid value", "malformed", "gap", "next session"]), st.none()),

@@ -15,7 +15,7 @@ import pyarrow.parquet
 import pytest
 import scipy.io
 
-from aeroloop.protocol.messages.models import Telemetry
+from aeroloop.protocol.messages.models import Telemetry, Truth
 from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
@@ -25,7 +25,7 @@ from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.table import columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.review import review
+from aeroloop.service.review.review import read, review
 from tests.support.edited_log import PERIOD_NS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
 
@@ -109,6 +109,33 @@ def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: 
         if last == row["tick"]:  # the gyro's noise and its quantizer lie between
             assert row["rate_z_rad_s"] == pytest.approx(row["truth_rate_z_rad_s"], abs=quantizer.limit / 20)
     assert len(set(parquet["truth_voltage_2_V"])) > 3
+
+
+def test_a_plants_own_signals_reach_the_log_the_table_and_the_page(tmp_path: Path) -> None:
+    """One that is never known is an empty column, and no panel; a stranger's add no columns without end."""
+    settings = load(overrides=["plant.kind=tests.support.own_plants:Pair", "loop.lockstep=true"])
+    messages = made(settings, 60, truth_every=10)
+    forged = Truth(tick=0, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0,) * 3, voltages=(0.0, 0.0), session=SESSION)
+    for i in range(3):
+        signals = {f"x{i}_{j}": 1.0 for j in range(7)}
+        forged = forged.model_copy(update={"session_tick": 55, "signals": signals})
+        messages.append(next(m for m in messages if m.key.endswith("/truth"))._replace(payload=forged.encode()))
+    write(tmp_path / "own.mcap", settings, messages)
+    exported = export([tmp_path / "own.mcap"], "parquet", tmp_path / "own.parquet")
+    assert exported.damages == ["malformed: 1 of truth"]
+    table = pyarrow.parquet.read_table(tmp_path / "own.parquet").to_pydict()
+    assert len([name for name in table if name.startswith("plant_")]) == 16
+    assert table["plant_battery_V"] == [None] * len(table["tick"])
+    assert table["plant_angle_deg"][:55] == pytest.approx(table["truth_yaw_deg"][:55])
+    assert len(set(table["plant_angle_deg"][:55])) == 6
+    assert table["plant_x0_0"] == [None] * 55 + [1.0] * 5
+    panels = [panel for panel in read(tmp_path / "own.mcap").report().panels if panel.group == "signals"]
+    assert [panel.label for panel in panels] == [
+        "angle_deg",
+        *sorted(name[6:] for name in table if name[:7] == "plant_x"),
+    ]
+    drawn = panels[0].lines[0].values
+    assert list(drawn[:51:10]) == pytest.approx(table["plant_angle_deg"][:51:10])
 
 
 def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
@@ -238,6 +265,9 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
         exported = export([log], "parquet", out, session=session)
         table = pyarrow.parquet.read_table(out, columns=["session", "tick"]).to_pydict()
         assert exported.rows == len(table["tick"])
+        everything = {f"{VEHICLE}/{SESSION}", f"{VEHICLE}/{SHORT}"}
+        assert set(exported.sessions or ()) | set(exported.left_out) == everything
+        assert len(exported.sessions or ()) + len(exported.left_out) == 2
         return list(zip(table["session"], table["tick"], strict=True))
 
     first = [(SESSION, k) for k in range(TICKS) if k not in SKIPPED]
@@ -289,6 +319,17 @@ def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Ta
     for name, column in table.items():
         if "delay" not in name:  # the clocks' offset is fitted by what is read
             assert column == parquet[name][begin : begin + 101], name
+
+
+def test_the_command_names_the_sessions_that_it_leaves_out(
+    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for session, left_out in (("1", SHORT), ("2", SESSION), ("all", None)):
+        out = str(tmp_path / f"{session}.csv")
+        assert execute(["log", "export", str(log), "--to", "csv", "--out", out, "--session", session]) == 0
+        printed = capfd.readouterr().out
+        assert (f"not exported of this log: {VEHICLE}/{left_out};" in printed) == bool(left_out)
+        assert ("not exported" in printed) == bool(left_out)
 
 
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:

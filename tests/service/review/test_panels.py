@@ -12,14 +12,12 @@ from aeroloop.service.config import load
 from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.events import Truths
-from aeroloop.service.review.panels import outline, panels_of
+from aeroloop.service.review.panels import NO_TRUTHS, outline, panels_of
 from aeroloop.service.review.report import Line
 from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import check_theorem
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest
-
-NO_TRUTHS = Truths(np.empty(0, dtype=np.int64), np.empty((0, 4)), np.empty((0, 3)))
 
 Drawn = dict[tuple[str, str], Line]
 """Lines by the label of their panel's axis, and their own."""

@@ -22,7 +22,7 @@ from aeroloop.service.review.report import Check, Findings, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
-from aeroloop.service.theorem import any_law
+from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
@@ -100,13 +100,13 @@ def test_on_the_papers_plant_every_inequality_holds_at_every_tick(logs: Logs) ->
 def test_a_bound_that_is_half_of_what_it_must_be_is_found_broken(
     logs: Logs, monkeypatch: pytest.MonkeyPatch, equation: str, names: tuple[str, ...]
 ) -> None:
-    def halved(settings: Settings) -> Evaluated:
-        e = evaluate(settings)
+    def halved(settings: Settings, **options: Any) -> Evaluated:
+        e = evaluate(settings, **options)
         assert e.paper is not None
         lemma = replace(e.paper.lemma, **{name: getattr(e.paper.lemma, name) / 2 for name in names})
         return replace(e, paper=e.paper._replace(lemma=lemma))
 
-    monkeypatch.setattr(any_law, "evaluate", halved)
+    monkeypatch.setattr(certificate, "evaluate", halved)
     findings, theorem = judged(logs("long"))
     (one,) = (one for one in theorem.lemma if one.broken)
     assert one.equation == equation

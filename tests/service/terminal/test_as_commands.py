@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Message, Points, Re
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.cli.main import execute
-from aeroloop.service.cli.op import WITHIN_S, as_commands
+from aeroloop.service.cli.op import as_commands
 from aeroloop.service.host import operator
 
 angle = st.floats(-1e4, 1e4)
@@ -70,7 +70,7 @@ def test_the_commands_printed_send_what_was_read(record: SessionRecord) -> None:
                 words.pop()
             assert words[:2] == ["aeroloop", "op"]
             assert execute(words[1:]) == 0
-    track = Track(reference=record.reference, within_s=record.within_s or WITHIN_S)
+    track = Track(reference=record.reference, within_s=record.within_s or None)
     assert [(what, message) for _, what, message in sent] == [
         ("aero-2 set_gains", record.gains),
         ("aero-2 track", track),

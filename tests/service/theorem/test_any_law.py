@@ -11,8 +11,7 @@ import pytest
 from aeroloop import ExpressionLaw, LawSettings
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.theorem.any_law import OwnCertificate, certify_any, described_certificate
-from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.certificate import OwnCertificate, certificate_of, certify, described_certificate
 from aeroloop.service.theorem.feedback import NoTheoremError
 
 HERE = "tests.service.theorem.test_any_law"
@@ -49,7 +48,7 @@ class Careless(Silent):
 
 
 def test_the_papers_law_has_the_papers_certificate() -> None:
-    assert certify_any(load()) == certify(load())
+    assert certificate_of(load()) == certify(load())
 
 
 @pytest.mark.parametrize(("mass", "code", "verdict"), [(2, 0, "Nothing moves."), (0.5, 1, "It may blow away.")])
@@ -79,12 +78,12 @@ def test_a_law_that_brings_a_certificate_has_its_own(
 )
 def test_without_a_certificate_one_line_says_why(kind: str, line: str) -> None:
     with pytest.raises(NoTheoremError) as error:
-        certify_any(load(overrides=[f"law.kind={kind}"]))
+        certificate_of(load(overrides=[f"law.kind={kind}"]))
     assert str(error.value).startswith(line)
 
 
 def test_an_own_certificate_keeps_what_the_law_says() -> None:
-    found = certify_any(load(overrides=[f"law.kind={HERE}:Silent"]))
+    found = certificate_of(load(overrides=[f"law.kind={HERE}:Silent"]))
     assert isinstance(found, OwnCertificate)
     assert found.model_extra == {"decay_rate": 0.5}
 

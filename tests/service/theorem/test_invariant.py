@@ -15,10 +15,10 @@ from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.interface import ExpressionLaw, Now
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.reference import Angles, Floats, Plan
+from aeroloop.service.theorem.bounds import coordinates, rotation, times
 from aeroloop.service.theorem.certificate import premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
 from aeroloop.service.theorem.invariant import Premises, Reach, distance, largest_start, reach, without_error
-from aeroloop.service.theorem.lemma import coordinates, rotation, times
 from aeroloop.service.theorem.linear import Axis, responses, system
 from aeroloop.service.theorem.plant_bounds import EncoderRate, PlantBounds
 

@@ -19,9 +19,9 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.reference import Plan, reference_function
+from aeroloop.service.control.reference import Floats, Plan, reference_function
+from aeroloop.service.theorem.bounds import Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from aeroloop.service.theorem.certificate import Paper, evaluate
-from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
 

@@ -18,6 +18,7 @@ from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quate
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, Equations, equations, projection
 from aeroloop.service.control.laws.evaluation import law_function, received
+from aeroloop.service.control.laws.registry import LawError
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -283,7 +284,7 @@ def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float,
     settings = AdaptiveSettings.model_validate({"allocation": allocation})
     with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
         equations(settings)
-    with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
+    with pytest.raises(LawError, match=r"law\.allocation \(B\) has no inverse"):
         law_function(Adaptive(settings, 0.002, 3))
 
 

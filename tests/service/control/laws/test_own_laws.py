@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import isnan
 from pathlib import Path
 from random import Random
-from typing import get_args
+from typing import Any, get_args
 
 import casadi as ca
 import numpy as np
@@ -18,7 +19,7 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.control.laws.interface import gravity_torque
+from aeroloop.service.control.laws.interface import gravity_torque, voltages_for
 from aeroloop.service.lab.experiment import experiment, run_experiment
 from tests.service.control.test_tick import frames
 from tests.support import failing_laws
@@ -126,8 +127,8 @@ WHY = {
     "raises": f"law {FAILING}:Failing: RuntimeError: the estimator diverged (failing_laws.py, line {{line}})",
     "gives NaN": f"law {FAILING}:Failing gave no number",
     "gives one voltage": "it gives 1 voltages for 3 actuators",
-    "another shape": "its state after a tick is not that of `reset`: ticks",
-    "another name": "its state after a tick is not that of `reset`: ticks",
+    "another shape": "its state after a tick is ticks of 2, and its first state is ticks of 1",
+    "another name": "its state after a tick is tocks of 1, and its first state is ticks of 1",
     "gives no number": "ValueError: could not convert string to float: 'much'",
 }
 
@@ -151,9 +152,14 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     assert len(one.fault.splitlines()) == 1
 
 
-def test_the_weights_torque_of_an_array_is_that_of_an_expression() -> None:
-    law, q = Settings().law, np.array([0.8, -0.2, 0.4, 0.4])
-    x = ca.SX.sym("x", 4)
-    expression = ca.Function("torque", [x], [gravity_torque(law, x)])
-    assert isinstance(gravity_torque(law, q), np.ndarray)
-    assert gravity_torque(law, q).tolist() == np.asarray(expression(q)).ravel().tolist()
+def test_helpers_of_a_law_give_arrays_for_numbers_and_expressions_for_expressions() -> None:
+    """Whether the numbers are an array or a list, and for as many motors as there are."""
+    law, q, torque = Settings().law, [0.8, -0.2, 0.4, 0.4], [0.0, 0.004, -0.003]
+    helpers: list[tuple[Callable[[Any], Any], list[float]]] = [(partial(gravity_torque, law), q)]
+    helpers += [(partial(voltages_for, law, actuators=motors), torque) for motors in (2, 3)]
+    for helper, numbers in helpers:
+        x = ca.SX.sym("x", len(numbers))
+        expected = np.asarray(ca.Function("helper", [x], [helper(x)])(numbers)).ravel()
+        for argument in (numbers, np.array(numbers)):
+            assert isinstance(helper(argument), np.ndarray)
+            assert helper(argument) == pytest.approx(expected, rel=1e-12)  # of B: another way to solve

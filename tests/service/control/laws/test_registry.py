@@ -15,6 +15,8 @@ from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import Adaptive
 from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, own_settings, with_gains
+from aeroloop.service.lab.experiment import experiment
+from tests.support import failing_laws
 from tests.support.failing_laws import FAILING
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Expressions
 
@@ -57,10 +59,10 @@ def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list
     ("kind", "why"),
     [
         ("adaptve", "law.kind = 'adaptve' is not known: it is one of adaptive, "),
-        (f"{HERE}:Pd", f"{HERE} has no Pd; its classes are"),
+        (f"{HERE}:Pd", f"{HERE} has no Pd; its classes of aeroloop.Law are Expressions, "),
         (f"{FAILING}:NoLaw", "does not derive from aeroloop.Law"),
         (f"{FAILING}:not_even_a_class", "does not derive from aeroloop.Law"),
-        (f"{FAILING}:NoSettings", "has no Settings that derive from aeroloop.LawSettings"),
+        (f"{FAILING}:NoSettings", "has no Settings that derive from aeroloop.LawSettings (failing_laws.py, line "),
         (f"{HERE}:", "does not name a class"),
         (":PD", "does not name a class"),
         ("tests.support.their_laws:PD", "there is no module tests.support.their_laws here"),
@@ -73,17 +75,32 @@ def test_a_law_that_is_not_there_or_is_none_is_refused_in_one_line(kind: str, wh
 
 
 @pytest.mark.parametrize(
-    ("kind", "why"),
+    ("mistake", "why", "at"),
     [
-        ("WrongWidth", "it gives 1 voltages for 2 actuators"),
-        ("WrongState", "its state after a tick is not that of `initial`: sum"),
+        ("width", "ValueError: it gives 1 voltages for 2 actuators", "def expressions"),
+        ("state", "ValueError: its state after a tick is sum of 3, and its first state is sum of 2", "def expressions"),
+        ("one value", "TypeError: it gives one value, not two: the voltages, and the state", "def expressions"),
+        ("iterates", "TypeError: CasADi matrices are not iterable by design", "# iterates"),
+        ("no such setting", "'MistakenSettings' object has no attribute 'kz'", "# no such setting"),
+        ("no such vector", "AttributeError: 'Now' object has no attribute 'speed'", "# no such vector"),
+        ("initial", "TypeError: 'float' object is not iterable", "def initial"),
+        ("gain", "LawSettings' object has no attribute 'kz'", "class NoSuchGain"),
     ],
 )
-def test_expressions_of_another_shape_are_refused_before_the_first_tick(kind: str, why: str) -> None:
-    settings = load(overrides=[f"law.kind={FAILING}:{kind}"])
-    with pytest.raises(LawError) as error:
-        Controller(settings.wire, settings.law, settings.reference, 0.002)
-    assert f"law {FAILING}:{kind}: ValueError: {why}" in str(error.value)
+def test_a_first_mistake_in_expressions_is_one_line_with_class_file_and_line(mistake: str, why: str, at: str) -> None:
+    """Before the first tick, in the controller and in an experiment that compiles the whole loop."""
+    kind = f"{FAILING}:{'NoSuchGain' if mistake == 'gain' else 'Mistaken'}"
+    own = load(overrides=[f"law.kind={kind}", *([] if mistake == "gain" else [f"law.mistake={mistake}"])])
+    lines = Path(failing_laws.__file__).read_text().splitlines()
+    begins = lines.index("class Mistaken(ExpressionLaw[MistakenSettings]):")
+    line = 1 + next(i for i in range(begins, len(lines)) if at in lines[i])
+    for start in (lambda: Controller(own.wire, own.law, own.reference, 0.002), lambda: experiment(own, 0.1)):
+        with pytest.raises(LawError) as error:
+            start()
+        assert f"law {kind}: " in str(error.value)
+        assert why in str(error.value)
+        assert str(error.value).endswith(f"(failing_laws.py, line {line})")
+        assert len(str(error.value).splitlines()) == 1
 
 
 def test_gains_are_bounded_by_the_law_and_it_has_no_others() -> None:
