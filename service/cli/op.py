@@ -1,4 +1,8 @@
-"""`aeroloop op`: an operator's verbs, sent to running roles over the network."""
+"""`aeroloop op`: an operator's verbs, sent to running roles over the network.
+
+They address the configured vehicle. Where none is configured, `stop`, `status` and `top` are about every vehicle on the
+network, and the others about the only one: where there are several, they refuse.
+"""
 
 from __future__ import annotations
 
@@ -43,13 +47,15 @@ def status(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print the status of every role on the network. Exits with 1 if no role answers."""
+    """Print the status of the vehicle's roles, of all if none is set. Exits with 1 if no role answers."""
     target = target_of(config, overrides)
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
     with guarded():
         found = gather(target.network)
+        if "vehicle" in target.model_fields_set:
+            found = found._replace(statuses={target.vehicle: found.statuses.get(target.vehicle, {})})
     well = not check or not troubles(found)
     if json:
         from json import dumps
@@ -95,7 +101,7 @@ def show(
     from aeroloop.service.host.operator import show as record_of
 
     with guarded():
-        record = record_of(target.network, target.vehicle, last=last)
+        record = record_of(target.network, _vehicle(target), last=last)
     if json:
         typer.echo(record.model_dump_json(indent=2))
     else:
@@ -284,4 +290,11 @@ def _send(target: Target, topic: str, message: Message | None = None) -> None:
     from aeroloop.service.host.operator import send
 
     with guarded():
-        typer.echo(send(target.network, target.vehicle, topic, message or Request()))
+        typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
+
+
+def _vehicle(target: Target) -> str:
+    """The configured vehicle, else the only one on the network; OperatorError if there are several."""
+    from aeroloop.service.host.operator import only_vehicle
+
+    return target.vehicle if "vehicle" in target.model_fields_set else only_vehicle(target.network) or target.vehicle

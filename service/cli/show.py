@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aeroloop.service.cli.common import Config, Overrides, checked, fail, settings_of
+from aeroloop.service.cli.common import Config, Overrides, checked, fail, loop_of, settings_of
+
+if TYPE_CHECKING:
+    from aeroloop.service.config import Settings
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -17,6 +22,9 @@ group = typer.Typer()
 
 @group.command("config")
 def show_config(
+    check: Annotated[
+        bool, typer.Option("--check", help="Print only what is wrong, and exit with 2 if its loop cannot begin.")
+    ] = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -24,10 +32,48 @@ def show_config(
     from aeroloop.protocol.plugins import PluginError
     from aeroloop.service.config import with_law_settings
 
+    if check:
+        _check(loop_of(config, overrides))
+        return
     settings = settings_of(config, overrides)
     with checked(), suppress(PluginError):  # a class that is not on this host: its keys as they are written
         settings = with_law_settings(settings)
     typer.echo(settings.toml(comments=True), nl=False)
+
+
+def _check(settings: Settings) -> None:
+    """Make what the configured processes begin with; what does not fit ends the command."""
+    from aeroloop.plant_emulator.hosts.emulator import Emulator
+    from aeroloop.service.control.controller import Controller
+
+    with checked():
+        Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        if settings.plant.via == "emulator":
+            Emulator(settings.loop, settings.wire, settings.plant, Event()).endpoint.plant.close()
+
+
+@group.command()
+def api() -> None:
+    """List the public names of the Python package, each with its arguments or fields and what it is."""
+    from aeroloop import research
+
+    for name in research.__all__:
+        value = getattr(research, name)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            sentence = (inspect.getdoc(value) or "").partition("\n")[0]
+            typer.echo(f"{name}{_signature(value)}\n    {sentence}")
+        else:
+            typer.echo(f"{name}\n    A type, for the fields of a law's settings.")
+
+
+def _signature(value: Any) -> str:
+    """Arguments of a function or a class; of a model or a named tuple its fields."""
+    if fields := getattr(value, "model_fields", None) or getattr(value, "_fields", None):
+        return f"({', '.join(fields)})"
+    try:
+        return str(inspect.signature(value)).replace("'", "").removesuffix(" -> None")
+    except ValueError:  # of a built-in base
+        return ""
 
 
 @group.command()

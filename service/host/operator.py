@@ -77,6 +77,22 @@ def gather(network: NetworkSettings) -> Gathered:
     return Gathered(statuses, silent)
 
 
+def only_vehicle(network: NetworkSettings) -> str | None:
+    """The one vehicle on the network that has a controller or a plant; None if there is none.
+
+    Raises:
+        OperatorError: There are several.
+    """
+    try:
+        found = gather(network).statuses
+    except OperatorError:  # what is asked of a vehicle says so, too, after a while
+        return None
+    vehicles = sorted(name for name, roles in found.items() if "plant" in roles or "controller" in roles)
+    if len(vehicles) > 1:
+        raise OperatorError(f"there are {', '.join(vehicles)}: name one, such as --set vehicle={vehicles[0]}")
+    return vehicles[0] if vehicles else None
+
+
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
     """Send a request to a vehicle's plant (`arm`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 

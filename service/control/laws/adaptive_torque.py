@@ -78,7 +78,10 @@ class AdaptiveTorqueSettings(TrackingSettings):
         default=_TUNED["torque_bound"], description="largest estimate of the constant torque about each axis [N·m]"
     )
     damping_bound: float = Field(
-        default=0.03, gt=0, description="largest change of each damping estimate from its first value [N·m·s/rad]"
+        default=0.03,
+        gt=0,
+        le=100,
+        description="largest change of each damping estimate from its first value [N·m·s/rad]",
     )
     coulomb_bound: float = Field(
         default=0.005, gt=0, description="largest change of each Coulomb estimate from its first value [N·m]"

@@ -73,6 +73,7 @@ class EstimateSettings(LawSettings):
     damping_bound: float = Field(
         default=0.03,
         gt=0,
+        le=100,
         description="k_θ: ‖θ − θ̂(t0)‖ is assumed to be below this, and a law that adapts keeps ‖θ̂ − θ̂(t0)‖ below "
         "k_θ/0.95 [N·m·s/rad]",
     )
