@@ -24,7 +24,7 @@ from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import Target, merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import LawSection, own_settings
+from aeroloop.service.control.laws.registry import LawSection, law_settings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 
@@ -126,7 +126,7 @@ def with_law_settings(settings: Settings) -> Settings:
         PluginError: There is no such law.
         LawError: Its settings are wrong.
     """
-    return settings.model_copy(update={"law": own_settings(settings.law)})
+    return settings.model_copy(update={"law": law_settings(settings.law)})
 
 
 def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:

@@ -26,7 +26,7 @@ from aeroloop.service.control.reference import (
     Floats,
     FollowError,
     Limits,
-    Plan,
+    Trajectory,
     reference_function,
 )
 
@@ -106,7 +106,7 @@ def at_rest(angle: Floats) -> Angles:
     return Angles(angle, np.zeros_like(angle), np.zeros_like(angle))
 
 
-def nearest_turn(attitude: Vector, target: Plan) -> Vector:
+def nearest_turn(attitude: Vector, target: Trajectory) -> Vector:
     """The same attitude, each angle within half a turn of the first of the target [deg]: −10° is 350°."""
     first = np.degrees(target.first.angle[0])
     roll, pitch, yaw = (a + 360.0 * round((f - a) / 360.0) for a, f in zip(attitude, first.tolist(), strict=True))
@@ -161,7 +161,7 @@ def _backwards(state: Angles) -> Angles:
     return Angles(state.angle, -state.rate, state.acceleration)
 
 
-def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
+def shortest(target: Trajectory, here: Angles, limits: Limits) -> Approach:
     """The shortest approach to a target within the limits, from a state. Raises FollowError if there is none."""
     there = _backwards(target.first)
     brake_s, run_up_s = braking_times(here, limits), braking_times(there, limits)
@@ -186,12 +186,12 @@ def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
     return Approach(within_s, None, tuple(brake_s.tolist()), tuple(run_up_s.tolist()), here.row)
 
 
-def shortest_from_rest(target: Plan, start: Vector, limits: Limits) -> Approach:
+def shortest_from_rest(target: Trajectory, start: Vector, limits: Limits) -> Approach:
     """The shortest approach from roll, pitch, yaw at which a body is found [deg]. Raises FollowError."""
     return shortest(target, at_rest(np.radians(np.array([start]))), limits)._replace(start=start, here=None)
 
 
-def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) -> Approach:
+def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limits) -> Approach:
     """The approach to a set-point within the limits: a single quintic in `within_s` or somewhat more, or the shortest.
 
     A quintic is taken if it goes no further beyond its start or its target than braking does, within the limits or
@@ -213,8 +213,8 @@ def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) ->
     return shortest(target, here, limits).at_least(within_s)
 
 
-def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan:
-    """A plan that reaches the target by an approach.
+def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -> Trajectory:
+    """A trajectory that reaches the target by an approach.
 
     The target's own time begins when it is reached. The approach begins at time t [s] from the state `here`, of shapes
     (1, 3), unless it has one of its own, as `start` or `here`.
@@ -243,7 +243,7 @@ def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan
 
 
 class Motion:
-    """The reference as the loop evaluates it, tick by tick, and `plan`, which is followed now.
+    """The reference as the loop evaluates it, tick by tick, and `trajectory`, which is followed now.
 
     Args:
         reference: What to follow from t = 0 on.
@@ -254,13 +254,13 @@ class Motion:
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
         self._function = Compiled(reference_function(), shared)
         self._time = self._function.inputs["t"]
-        self.plan = Plan.of(reference)
+        self.trajectory = Trajectory.of(reference)
         self._load(0)
 
     def set(self, t: float) -> None:
         """Write time t [s] and its piece to the inputs; t never decreases between calls."""
         if t >= self._until:
-            self._load(self.plan.piece(t))
+            self._load(self.trajectory.piece(t))
         self._time[0] = t
 
     def at(self, t: float) -> tuple[list[float], list[float], list[float]]:
@@ -270,16 +270,16 @@ class Motion:
         q_d, omega_d, omega_d_dot = map(list, self._function.outputs.values())
         return q_d, omega_d, omega_d_dot
 
-    def follow(self, target: Plan, t: float, approach: Approach = JUMP) -> None:
-        """Follow another plan from time t [s] on, by an approach; its own time begins when it is reached."""
-        self.plan = plan = approached(target, self.here(t), t, approach)
-        self._load(plan.piece(t))
+    def follow(self, target: Trajectory, t: float, approach: Approach = JUMP) -> None:
+        """Follow another trajectory from time t [s] on, by an approach; its own time begins when it is reached."""
+        self.trajectory = trajectory = approached(target, self.here(t), t, approach)
+        self._load(trajectory.piece(t))
 
     def change(self, change: Change, period: float) -> None:
         """Follow the reference of a change, if it has one, from its tick on; period in s."""
         if change.reference is not None:
             approach = Approach(*(getattr(change, name) for name in Approach._fields))
-            self.follow(Plan.of(change.reference), change.tick * period, approach)
+            self.follow(Trajectory.of(change.reference), change.tick * period, approach)
 
     def rest(self, t: float, limits: Limits) -> Hold:
         """The attitude reached by braking from time t [s] on."""
@@ -290,15 +290,15 @@ class Motion:
 
     def here(self, t: float) -> Angles:
         """Roll, pitch, yaw, their rates and accelerations at time t [s]. Shapes (1, 3)."""
-        i = self.plan.piece(t)
-        tau = np.zeros((len(self.plan.starts), 1))
-        tau[i] = t - self.plan.starts[i]
-        return Angles(*(part[i] for part in self.plan.at(tau)))
+        i = self.trajectory.piece(t)
+        tau = np.zeros((len(self.trajectory.starts), 1))
+        tau[i] = t - self.trajectory.starts[i]
+        return Angles(*(part[i] for part in self.trajectory.at(tau)))
 
     def _load(self, i: int) -> None:
-        plan, inputs = self.plan, self._function.inputs
-        self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else inf
-        inputs["start"][0] = plan.starts[i]
-        inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # CasADi is column-major
-        inputs["amplitude"][:] = memoryview(plan.amplitude[i].copy())
-        inputs["frequency"][:] = memoryview(plan.frequency[i].copy())
+        trajectory, inputs = self.trajectory, self._function.inputs
+        self._until = float(trajectory.starts[i + 1]) if i + 1 < len(trajectory.starts) else inf
+        inputs["start"][0] = trajectory.starts[i]
+        inputs["quintic"][:] = memoryview(trajectory.quintic[i].ravel())  # CasADi is column-major
+        inputs["amplitude"][:] = memoryview(trajectory.amplitude[i].copy())
+        inputs["frequency"][:] = memoryview(trajectory.frequency[i].copy())

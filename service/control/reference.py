@@ -4,7 +4,7 @@ Every reference is a sequence of pieces, and every piece a quintic plus a sinuso
 CasADi function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and
 its derivative follow by CasADi's own derivatives, so they are exact and consistent.
 
-The extremes of a quintic are those of 65 samples, the extremes of a sinusoid suprema over its phases: `Plan.largest`.
+The extremes of a quintic are those of 65 samples, those of a sinusoid suprema over its phases: `Trajectory.largest`.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Angles(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class Trajectory:
     """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends.
 
     Attributes:
@@ -107,8 +107,8 @@ class Plan:
     frequency: Floats
 
     @classmethod
-    def of(cls, reference: Reference) -> Plan:
-        """The plan of a reference that begins at t = 0. A stream holds 0 until its first set-point."""
+    def of(cls, reference: Reference) -> Trajectory:
+        """The trajectory of a reference that begins at t = 0. A stream holds 0 until its first set-point."""
         if isinstance(reference, Points):
             return cls._through(np.array(reference.times), np.radians(np.array(reference.attitudes)))
         still = cls._polynomial(np.zeros(1), np.zeros((1, POWERS, 3)))
@@ -120,12 +120,12 @@ class Plan:
         return still
 
     @classmethod
-    def _polynomial(cls, starts: Floats, quintic: Floats) -> Plan:
+    def _polynomial(cls, starts: Floats, quintic: Floats) -> Trajectory:
         return cls(starts, quintic, np.zeros((len(starts), 3)), np.zeros((len(starts), 3)))
 
     @classmethod
-    def _through(cls, times: Floats, angles: Floats) -> Plan:
-        """A plan through points, with rates and accelerations by differences; at rest at both ends."""
+    def _through(cls, times: Floats, angles: Floats) -> Trajectory:
+        """A trajectory through points, with rates and accelerations by differences; at rest at both ends."""
         rates = np.gradient(angles, times, axis=0)
         rates[0] = rates[-1] = 0.0
         accelerations = np.gradient(rates, times, axis=0)
@@ -141,18 +141,19 @@ class Plan:
         """The state at its start. Shapes (1, 3)."""
         return Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
 
-    def after(self, starts: Floats, lengths: Floats, knots: Angles) -> Plan:
-        """This plan from the last of these times on, preceded by quintics through the states at them.
+    def after(self, starts: Floats, lengths: Floats, knots: Angles) -> Trajectory:
+        """This trajectory from the last of these times on, preceded by quintics through the states at them.
 
         Args:
             starts: Times [s], increasing. Shape (n,).
             lengths: Their differences, before they were rounded by an addition [s]. Shape (n − 1,).
-            knots: States, the last of them this plan's first. Shapes (n, 3).
+            knots: States, the last of them this trajectory's first. Shapes (n, 3).
         """
         here, there = Angles(*(part[:-1] for part in knots)), Angles(*(part[1:] for part in knots))
         way = self._polynomial(starts[:-1], join(here, there, lengths))
         later = replace(self, starts=self.starts + starts[-1])
-        return Plan(*(np.concatenate([getattr(plan, name) for plan in (way, later)]) for name in self.__annotations__))
+        names = self.__annotations__
+        return Trajectory(*(np.concatenate([getattr(way, name), getattr(later, name)]) for name in names))
 
     def piece(self, t: float) -> int:
         """Index of the piece that contains time t [s]."""
@@ -261,7 +262,7 @@ class Plan:
 
 
 def turning(amplitude: Floats) -> Floats:
-    """The degree n of cos and sin of A sin x as factors of x, in `Plan.largest`. Shape as given."""
+    """The degree n of cos and sin of A sin x as factors of x, in `Trajectory.largest`. Shape as given."""
     degree: Floats = np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25))
     return degree
 
@@ -333,10 +334,16 @@ def reference_function() -> ca.Function:
 
 def desired(reference: Reference, period: float, ticks: int) -> Floats:
     """q_d, ω_d, ω̇_d of a reference at each tick of a `period` [s], as `Motion` has them. Shape (ticks, 10)."""
-    plan = Plan.of(reference)
+    trajectory = Trajectory.of(reference)
     t = np.arange(ticks) * period
-    piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
-    rows = t, plan.starts[piece], plan.quintic[piece], plan.amplitude[piece], plan.frequency[piece]
+    piece = np.maximum(0, np.searchsorted(trajectory.starts, t, side="right") - 1)
+    rows = (
+        t,
+        trajectory.starts[piece],
+        trajectory.quintic[piece],
+        trajectory.amplitude[piece],
+        trajectory.frequency[piece],
+    )
     function = Compiled(reference_function().map(ticks))
     for memory, row in zip(function.inputs.values(), rows, strict=True):
         np.asarray(memory)[:] = row.ravel()

@@ -39,7 +39,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
 from aeroloop.service.control.motion import Approach, nearest_turn, shortest, shortest_from_rest, to_set_point
-from aeroloop.service.control.reference import FollowError, Limits, Plan
+from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 
 START_S: Final = 1.0
 """Least time to reach a reference that no operator gave a time for, at a session's start [s]."""
@@ -114,9 +114,9 @@ class OperatorChanges:
     def _prepare_track(self, track: Track) -> Callable[[], Answer]:
         source: Source = "configured" if track.reference is None else "operator"
         reference = track.reference or self._configured
-        plan = self._check(reference)
+        trajectory = self._check(reference)
         self._running()
-        return lambda: self._track(reference, plan, track.within_s, source)
+        return lambda: self._track(reference, trajectory, track.within_s, source)
 
     def _set_gains(self, gains: Gains) -> Answer:
         """Use other gains from this tick on. No event and no record if they change nothing."""
@@ -130,7 +130,7 @@ class OperatorChanges:
             self._role.event("changed", f"gains set: {text}", self.record.session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
 
-    def _track(self, reference: Reference, plan: Plan, within_s: float | None, source: Source) -> Answer:
+    def _track(self, reference: Reference, trajectory: Trajectory, within_s: float | None, source: Source) -> Answer:
         """Follow a checked reference from this tick on, reached in `within_s` [s]; None: as soon as the limits allow.
 
         Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
@@ -138,13 +138,13 @@ class OperatorChanges:
         motion, held, t = self._running().motion, reference, self._time
         if isinstance(reference, Stream) or reference == Hold():
             held = motion.rest(t, self._limits)
-            plan = Plan.of(held)
-            approach = shortest(plan, motion.here(t), self._limits).at_least(START_S)
+            trajectory = Trajectory.of(held)
+            approach = shortest(trajectory, motion.here(t), self._limits).at_least(START_S)
         else:
-            approach = shortest(plan, motion.here(t), self._limits)
+            approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
         self.setpoints.begin()
-        self._follow(held, plan, approach)
+        self._follow(held, trajectory, approach)
         stream = reference if isinstance(reference, Stream) else held
         self._update_record(reference=stream, reference_from=source, since_tick=self._k, **approach._asdict())
         text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
@@ -161,7 +161,7 @@ class OperatorChanges:
         if self._settings.after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self.record.gains)
-        controller.motion.follow(Plan.of(self._present_reference), 0.0)
+        controller.motion.follow(Trajectory.of(self._present_reference), 0.0)
         self._started_near = False
         self.setpoints.discard()
         self._record_change(gains=self.record.gains, reference=self._present_reference)
@@ -213,19 +213,19 @@ class OperatorChanges:
         start, t, target = hold_here(attitude, rolls=self._limits.rolls), self._time, self._present_reference
         if self.record.reference_from != "configured" and target == Hold():
             target, approach = Hold(attitude=start), Approach(start=start)
-            plan = Plan.of(target)
+            trajectory = Trajectory.of(target)
             text = f"holds the attitude found, {in_words(target)}; `aeroloop op track configured` moves it"
         else:
             w, x, y, z = controller.motion.at(t)[0]
             away = degrees(distance(attitude, (w, x, y, z)))
             if self._settings.after_restart == "configured" and away <= self._settings.start_within_deg:
                 return
-            plan = Plan.of(target)
+            trajectory = Trajectory.of(target)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
-            approach = shortest_from_rest(plan, nearest_turn(start, plan), limits)
+            approach = shortest_from_rest(trajectory, nearest_turn(start, trajectory), limits)
             approach = approach.at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
-        self._follow(target, plan, approach)
+        self._follow(target, trajectory, approach)
         stream = self.record.reference if isinstance(self.record.reference, Stream) else target
         self._update_record(reference=stream, since_tick=self._k, **approach._asdict())
         self._role.event("changed", text, self.record.session, self._k)
@@ -250,25 +250,25 @@ class OperatorChanges:
         newest = self.setpoints.newest(stream, self._limits, self.record.session, self._k)
         if newest is None:
             return
-        hold, plan = newest
+        hold, trajectory = newest
         try:
             here = self._running().motion.here(self._time)
-            approach = to_set_point(plan, here, stream.within_s, self._limits)
+            approach = to_set_point(trajectory, here, stream.within_s, self._limits)
         except FollowError as error:
             self.setpoints.refuse(error, self.record.session)
             return
-        self._follow(hold, plan, approach)
+        self._follow(hold, trajectory, approach)
 
-    def _follow(self, reference: Reference, plan: Plan, approach: Approach) -> None:
-        self._running().motion.follow(plan, self._time, approach)
+    def _follow(self, reference: Reference, trajectory: Trajectory, approach: Approach) -> None:
+        self._running().motion.follow(trajectory, self._time, approach)
         self._present_reference = reference
         self._record_change(reference=reference, **approach._asdict())
 
-    def _check(self, reference: Reference) -> Plan:
-        """The reference's plan, which takes time. Raises FollowError beyond the limits."""
-        plan = Plan.of(reference)
-        plan.check(self._limits)
-        return plan
+    def _check(self, reference: Reference) -> Trajectory:
+        """The reference's trajectory, which takes time. Raises FollowError beyond the limits."""
+        trajectory = Trajectory.of(reference)
+        trajectory.check(self._limits)
+        return trajectory
 
     @property
     def _time(self) -> float:
@@ -345,7 +345,7 @@ class SetpointStream:
         self.discard()
         self._last_s = self._role.clock.monotonic()
 
-    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> tuple[Hold, Plan] | None:
+    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> tuple[Hold, Trajectory] | None:
         """The newest set-point received since the last tick that is not refused; silence of `timeout_s` is an event."""
         now, newest = self._role.clock.monotonic(), None
         for _ in range(SETPOINTS):
@@ -353,12 +353,12 @@ class SetpointStream:
                 break
             try:
                 hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
-                plan = Plan.of(hold)
-                plan.check(limits)
+                trajectory = Trajectory.of(hold)
+                trajectory.check(limits)
             except (MessageError, FollowError) as error:
                 self.refuse(error, session)
             else:
-                newest = hold, plan
+                newest = hold, trajectory
         if newest is not None:
             self._last_s = now
         elif self._last_s and now - self._last_s > stream.timeout_s:

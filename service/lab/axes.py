@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 
 from aeroloop.plant_emulator.plant import EMULATED, class_of
 from aeroloop.service.config import ConfigError, Settings, load_over
-from aeroloop.service.control.laws.registry import BUILT_IN, OwnLawSettings, law_class
+from aeroloop.service.control.laws.registry import BUILT_IN, CustomLawSettings, law_class
 
 LIMIT: Final = 10_000_000
 """Experiments of a sweep, at most: what fits into memory."""
@@ -128,7 +128,7 @@ def digest_of(description: dict[str, Any], duration_s: float) -> str:
     an MJCF or FMU; what these import is not. Raises PluginError if there is no such class.
     """
     parts: dict[str, Any] = {name: description[name] for name in SECTIONS}
-    law, plant = OwnLawSettings.model_validate(description["law"]), description["plant"]
+    law, plant = CustomLawSettings.model_validate(description["law"]), description["plant"]
     files = list[str]()
     if law.kind not in BUILT_IN:
         files.append(getfile(law_class(law)))

@@ -96,7 +96,7 @@ class Certificate(BaseModel):
         return {term.symbol: term.value for term in self.terms}[symbol]
 
 
-class OwnCertificate(BaseModel):
+class CustomCertificate(BaseModel):
     """What a user's law says is proven of a configuration: `Law.certify`. It may have more than these."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -282,7 +282,7 @@ def certify(
     )
 
 
-def certificate_of(settings: Settings, **options: Any) -> Certificate | OwnCertificate:
+def certificate_of(settings: Settings, **options: Any) -> Certificate | CustomCertificate:
     """The certificate of a configuration, whatever its law.
 
     Args:
@@ -298,9 +298,9 @@ def certificate_of(settings: Settings, **options: Any) -> Certificate | OwnCerti
     try:
         own = law.certify(settings)
         if own is not None:
-            return OwnCertificate.model_validate(own)
+            return CustomCertificate.model_validate(own)
     except ValidationError as error:
-        raise NoTheoremError(f"the certificate of law {kind} is none: {problem(error, OwnCertificate)}") from None
+        raise NoTheoremError(f"the certificate of law {kind} is none: {problem(error, CustomCertificate)}") from None
     except Exception as error:
         raise NoTheoremError(f"no certificate: {words_of(kind, error, law.certify)}") from None
     return certify(settings, **options)

@@ -1,8 +1,8 @@
 """Extremes of a reference: the bounds k_ω_d and k_ω̇_d of Assumption 1, its largest angles, rates and voltages.
 
-Of a sinusoid they are suprema over its phases (`Plan.largest`): over every combination, but for axes that commensurate
-frequencies lock to each other. Of points they are the largest of 65 samples a quintic, which also check an operator's
-references; those are within half a percent, which is added.
+Of a sinusoid they are suprema over its phases (`Trajectory.largest`): over every combination, but for axes that
+commensurate frequencies lock to each other. Of points they are the largest of 65 samples a quintic, which also check an
+operator's references; those are within half a percent, which is added.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Stream
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.interface import LawSettings, check_invertible
-from aeroloop.service.control.reference import Angles, Floats, Plan, turning
+from aeroloop.service.control.reference import Angles, Floats, Trajectory, turning
 from aeroloop.service.theorem.bounds import attitude_error
 
 _SLACK: Final = 1.005
@@ -69,26 +69,28 @@ def extremes(settings: Settings) -> Extremes:
         raise BoundlessError(
             "a stream's set-points are not known beforehand: certify a reference like them, by --set reference.kind=…"
         )
-    plan = Plan.of(settings.reference)
-    slack = 1.0 if plan.swings else _SLACK
+    trajectory = Trajectory.of(settings.reference)
+    slack = 1.0 if trajectory.swings else _SLACK
     with np.errstate(over="ignore", invalid="ignore"):
-        angle, rate, acceleration, jerk = plan.peaks()
-        half, rates, changes, torques = _products(plan, law)
+        angle, rate, acceleration, jerk = trajectory.peaks()
+        half, rates, changes, torques = _products(trajectory, law)
 
         def voltage(row: Floats) -> float:
-            return plan.largest(
+            return trajectory.largest(
                 lambda at: np.abs(feedforward(at, law)[:, -len(row) :] @ row), torques * [np.linalg.norm(row), 1, 1, 1]
             )
 
         def weighed(w: float) -> float:
-            return plan.largest(lambda at: _weighed(at, w), half * [sqrt(3) + w, 1, 1, 1])
+            return trajectory.largest(lambda at: _weighed(at, w), half * [sqrt(3) + w, 1, 1, 1])
 
         found = Extremes(
-            rate=slack * plan.fastest(),
-            acceleration=slack * plan.largest(lambda at: np.linalg.norm(body_rates(at)[1], axis=1), changes),
+            rate=slack * trajectory.fastest(),
+            acceleration=slack * trajectory.largest(lambda at: np.linalg.norm(body_rates(at)[1], axis=1), changes),
             jerk=slack * jerk_bound(rate, acceleration, jerk),
-            axis_rate=slack * plan.largest(lambda at: np.abs(body_rates(at)[0]).max(axis=1), rates),
-            half_angle=min(pi / 2, slack * asin(min(1.0, plan.largest(lambda at: np.sin(half_angles(at)), half)))),
+            axis_rate=slack * trajectory.largest(lambda at: np.abs(body_rates(at)[0]).max(axis=1), rates),
+            half_angle=min(
+                pi / 2, slack * asin(min(1.0, trajectory.largest(lambda at: np.sin(half_angles(at)), half)))
+            ),
             tilt=min(pi / 2, slack * float(angle[1])),
             eps=tuple((w, slack * weighed(w)) for w in _WEIGHTS),
             voltages=tuple(slack * voltage(row) for row in inverse),
@@ -99,13 +101,13 @@ def extremes(settings: Settings) -> Extremes:
     return found
 
 
-def _products(plan: Plan, law: LawSettings) -> tuple[Floats, Floats, Floats, Floats]:
-    """The products that q_d, ω_d, ω̇_d and the feedforward's torque are sums of, for `Plan.largest`. Shapes (m, 4).
+def _products(trajectory: Trajectory, law: LawSettings) -> tuple[Floats, Floats, Floats, Floats]:
+    """The products that q_d, ω_d, ω̇_d and the feedforward's torque are sums of. Shapes (m, 4) of `terms`.
 
     ω_d is a sum of an angle's rate times a unit vector that turns with roll and pitch, ω̇_d its derivative. Of ω × Jω
     counts ω × (J − jI)ω, with the mean j of the largest and the least moment.
     """
-    angle, (r, p, y), (dr, dp, dy), _ = plan.peaks()
+    angle, (r, p, y), (dr, dp, dy), _ = trajectory.peaks()
     a, b, _ = turning(angle)
     half = np.array([[1.0, *turning(angle / 2)]])
     rates = np.array([[r, 1, 0, 0], [p, a, 1, 0], [y, a, b, 1]])

@@ -147,7 +147,7 @@ def reach(p: Premises, start: float = 0.0) -> Reach | None:
     eps_e = 0.0
     for _ in range(_MOST_ITERATIONS):  # bounds grow with D, and D with the bounds: from 0 to the least
         sizes = {name: gain(start, D) for name, gain in linear.gains.items()}
-        found = _disturbances(p, linear, sizes, eps_e)
+        found = _bounds_after(p, linear, sizes, eps_e)
         if found is None or not all(isfinite(d) and d < _MOST for d in found.D):
             return None
         if found.eps_e <= eps_e and all(new <= old for new, old in zip(found.D, D, strict=True)):
@@ -190,7 +190,7 @@ def distance(p: Premises, c: Coordinates, sign: Floats, theta_error: Floats, des
     return norm(np.hstack([eps, c.z2])) + (inf if farthest is None or linear is None else linear.z * farthest.slow)
 
 
-def _disturbances(p: Premises, linear: Responses, at: dict[str, float], eps_e: float) -> Reach | None:
+def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: float) -> Reach | None:
     """D₁ to D₅ while the outputs of the error equations are within these sizes; None beyond what is proven.
 
     Args:

@@ -112,6 +112,7 @@ def test_what_is_no_measurement_is_one_line(gives: str, line: str) -> None:
     with pytest.raises(PlantError) as caught:
         plant.measure()
     assert line in str(caught.value)
+    assert "(own_plants.py, line " in str(caught.value)
 
 
 @given(volts=st.floats(allow_nan=False), limit=st.floats(min_value=0.1, max_value=100))

@@ -22,13 +22,13 @@ _OWN: Final = "package.module:Class"
 _OURS: Final[tuple[type[Law[Any]], ...]] = Adaptive, Nonadaptive, PD, PID, AdaptiveTorque, Sliding, LQR
 
 
-class OwnLawSettings(LawSettings):
-    """A user's law, as configured. Its own model checks the keys where the law is used: `own_settings`."""
+class CustomLawSettings(LawSettings):
+    """A user's law, as configured. Its own model checks the keys where the law is used: `law_settings`."""
 
     model_config = ConfigDict(extra="allow")
 
 
-MODELS: Final = {law.Settings.model_fields["kind"].default: law.Settings for law in _OURS} | {_OWN: OwnLawSettings}
+MODELS: Final = {law.Settings.model_fields["kind"].default: law.Settings for law in _OURS} | {_OWN: CustomLawSettings}
 """The model of each kind of `[law]`."""
 BUILT_IN: Final = {kind: f"{law.__module__}:{law.__name__}" for kind, law in zip(MODELS, _OURS, strict=False)}
 
@@ -54,7 +54,7 @@ class LawError(AeroloopError):
     """A law that cannot be used; one line with its name."""
 
 
-def own_settings(section: LawSettings) -> LawSettings:
+def law_settings(section: LawSettings) -> LawSettings:
     """The settings as the law's own model has them, defaults included.
 
     Raises:
@@ -75,7 +75,7 @@ def version_of(section: LawSettings) -> dict[str, str]:
 
 
 def gains_of(section: LawSettings) -> Gains:
-    """The configured gains. Raises as `own_settings`."""
+    """The configured gains. Raises as `law_settings`."""
     law, settings = _class_and_settings(section)
     return Gains.model_validate({name: getattr(settings, name) for name in law.gains})
 

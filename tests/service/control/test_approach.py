@@ -25,7 +25,7 @@ from aeroloop.service.control.motion import (
     shortest_from_rest,
     to_set_point,
 )
-from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
+from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
 from tests.service.control.test_motion import (
     BENCH,
     BODY,
@@ -63,7 +63,7 @@ tracked: st.SearchStrategy[Reference] = st.one_of(turns.map(lambda a: Hold(attit
 
 def _fits(reference: Reference, limits: Limits) -> bool:
     try:
-        Plan.of(reference).check(limits)
+        Trajectory.of(reference).check(limits)
     except FollowError:
         return False
     return True
@@ -85,17 +85,19 @@ def after(history: list[tuple[Reference, float, float]], limits: Limits) -> tupl
     """A motion after some changes, each as early as possible or later by a time, and the time of the next [s]."""
     followed, t = Followed(Hold()), 0.0
     for reference, longer_s, passed in history:
-        approach = shortest(Plan.of(reference), followed.motion.here(t), limits)
+        approach = shortest(Trajectory.of(reference), followed.motion.here(t), limits)
         followed.approach(reference, t, approach.at_least(approach.within_s + longer_s))
         t += passed
     return followed, t
 
 
-def way(plan: Plan, target: Plan, end: float) -> tuple[Array, Array, Array]:
+def way(trajectory: Trajectory, target: Trajectory, end: float) -> tuple[Array, Array, Array]:
     """Angles, rates, accelerations of the pieces before the target's, densely. Shapes (n, 3)."""
-    count = len(plan.starts) - len(target.starts)
-    edges = [*plan.starts[:count], end]
-    pieces = [piece_states(plan, i, np.linspace(a, b, DENSE // 4)[:, None]) for i, (a, b) in enumerate(pairwise(edges))]
+    count = len(trajectory.starts) - len(target.starts)
+    edges = [*trajectory.starts[:count], end]
+    pieces = [
+        piece_states(trajectory, i, np.linspace(a, b, DENSE // 4)[:, None]) for i, (a, b) in enumerate(pairwise(edges))
+    ]
     angles, rates, accelerations = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     return angles, rates, accelerations
 
@@ -109,7 +111,7 @@ def stopping(state: Angles, braking: float) -> Array:
     return distance
 
 
-def bounds(start: Angles, target: Plan, braking: float) -> tuple[Array, Array]:
+def bounds(start: Angles, target: Trajectory, braking: float) -> tuple[Array, Array]:
     """The interval between start and target, each extended by the distance in which it stops."""
     first = target.first
     before, behind = stopping(start, braking), stopping(first, braking)
@@ -132,11 +134,11 @@ def bounds(start: Angles, target: Plan, braking: float) -> tuple[Array, Array]:
 def test_no_axis_goes_further_beyond_its_start_or_its_target_than_it_takes_to_stop(
     start: Angles, reference: Reference, longer_s: float, braking: float
 ) -> None:
-    target = Plan.of(reference)
+    target = Trajectory.of(reference)
     approach = shortest(target, start, BODY._replace(braking=braking))
     approach = approach.at_least(approach.within_s + longer_s)
-    plan = approached(target, start, 0.0, approach)
-    angles, _, _ = way(plan, target, approach.within_s)
+    trajectory = approached(target, start, 0.0, approach)
+    angles, _, _ = way(trajectory, target, approach.within_s)
     low, high = bounds(start, target, braking)
     assert np.all(low <= angles)
     assert np.all(angles <= high)
@@ -147,11 +149,11 @@ def test_no_axis_goes_further_beyond_its_start_or_its_target_than_it_takes_to_st
 def test_braking_and_run_up_stay_within_the_limit_of_acceleration_or_the_one_that_they_find(
     start: Angles, reference: Reference, braking: float
 ) -> None:
-    target = Plan.of(reference)
+    target = Trajectory.of(reference)
     limits = NO_LIMITS._replace(braking=braking)  # none that would make it brake harder
     approach = shortest(target, start, limits).at_least(1e6)  # and no turn to speak of
-    plan = approached(target, start, 0.0, approach)
-    _, _, accelerations = way(plan, target, approach.within_s)
+    trajectory = approached(target, start, 0.0, approach)
+    _, _, accelerations = way(trajectory, target, approach.within_s)
     most = np.maximum(braking, np.maximum(np.abs(start.acceleration[0]), np.abs(target.first.acceleration[0])))
     assert np.all(np.abs(accelerations) <= most * (1 + 1e-6))  # 1e6 s round to 1e-10 s
 
@@ -162,11 +164,11 @@ def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
     history: list[tuple[Reference, float, float]], reference: Reference, longer_s: float
 ) -> None:
     followed, t = after(history, BODY)
-    target = Plan.of(reference)
+    target = Trajectory.of(reference)
     approach = shortest(target, followed.motion.here(t), BODY)
     approach = approach.at_least(approach.within_s + longer_s)
     followed.approach(reference, t, approach)
-    angles, _, _ = way(followed.plan, target, t + approach.within_s)
+    angles, _, _ = way(followed.trajectory, target, t + approach.within_s)
     tilts = np.arccos(np.cos(angles[:, 0]) * np.cos(angles[:, 1]))
     assert tilts.max() <= BODY.tilt * SAMPLED
     turning = [np.linalg.norm(followed.at(s)[1]) for s in np.linspace(t, t + approach.within_s, 300)]
@@ -183,7 +185,7 @@ def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
 )
 def test_near_the_limits_of_rate_and_tilt_it_brakes_harder(pitch: float, rate: float, acceleration: float) -> None:
     start = Angles(*(np.array([[0.0, x, 0.0]]) for x in (radians(pitch), rate, acceleration)))
-    target = Plan.of(Hold())
+    target = Trajectory.of(Hold())
     approach = shortest(target, start, BENCH)
     angles, rates, _ = way(approached(target, start, 0.0, approach), target, approach.within_s)
     assert np.abs(rates).max() <= BENCH.rate * SAMPLED
@@ -195,19 +197,21 @@ def test_near_the_limits_of_rate_and_tilt_it_brakes_harder(pitch: float, rate: f
 def test_neither_angle_nor_rate_nor_acceleration_jumps(
     start: Angles, reference: Reference, longer_s: float, t: float
 ) -> None:
-    target = Plan.of(reference)
+    target = Trajectory.of(reference)
     approach = shortest(target, start, BODY)
     approach = approach.at_least(approach.within_s + longer_s)
-    plan = approached(target, start, t, approach)
-    count = len(plan.starts) - len(target.starts)
-    assert plan.starts[0] == t
-    assert plan.starts[count] == t + approach.within_s
-    sides = [((start.angle[0], start.rate[0], start.acceleration[0]), piece_states(plan, 0, t))]
-    for i, end in enumerate(plan.starts[1 : count + 1]):
-        sides.append((piece_states(plan, i, end), piece_states(plan, i + 1, end)))
+    trajectory = approached(target, start, t, approach)
+    count = len(trajectory.starts) - len(target.starts)
+    assert trajectory.starts[0] == t
+    assert trajectory.starts[count] == t + approach.within_s
+    sides = [((start.angle[0], start.rate[0], start.acceleration[0]), piece_states(trajectory, 0, t))]
+    for i, end in enumerate(trajectory.starts[1 : count + 1]):
+        sides.append((piece_states(trajectory, i, end), piece_states(trajectory, i + 1, end)))
     around = [state for side in sides for state in side]
     for before, after in sides:
-        tolerance = rounding(around, t + approach.within_s, float(np.diff(plan.starts[: count + 1]).min())) + 1e-300
+        tolerance = (
+            rounding(around, t + approach.within_s, float(np.diff(trajectory.starts[: count + 1]).min())) + 1e-300
+        )
         for order in range(3):
             assert np.abs(before[order] - after[order]).max() <= tolerance[order]
 
@@ -220,7 +224,7 @@ def test_neither_angle_nor_rate_nor_acceleration_jumps(
 def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_less_would_not(
     start: Angles, reference: Reference, more: list[int]
 ) -> None:
-    target = Plan.of(reference)
+    target = Trajectory.of(reference)
     least = shortest(target, start, BODY)
     with pytest.raises(FollowError) as refused:
         least.lasting(0.95 * least.within_s, BODY)
@@ -237,8 +241,8 @@ def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_
     turn_s = least.within_s - max(least.brake_s or (0.0,)) - max(least.run_up_s or (0.0,))
     shorter = turn_s - 0.05 * least.within_s
     if turn_s > LEAST_TURN_S * (1 + 1e-9) and shorter > 0:
-        plan = approached(target, start, 0.0, least._replace(within_s=0.95 * least.within_s))
-        angles, rates, _ = way(plan, target, 0.95 * least.within_s)
+        trajectory = approached(target, start, 0.0, least._replace(within_s=0.95 * least.within_s))
+        angles, rates, _ = way(trajectory, target, 0.95 * least.within_s)
         assert Angles(angles, rates, rates).speeds().max() > BODY.rate * 1.04
 
 
@@ -266,7 +270,7 @@ def test_what_is_too_short_is_refused_with_what_takes_so_long_and_the_time_that_
 ) -> None:
     start = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, rate, 0.0)))
     with pytest.raises(FollowError) as refused:
-        shortest(Plan.of(target), start, BENCH).lasting(within_s, BENCH)
+        shortest(Trajectory.of(target), start, BENCH).lasting(within_s, BENCH)
     assert str(refused.value).startswith("the approach is too short: ")
     assert str(refused.value).endswith(text)
 
@@ -274,16 +278,16 @@ def test_what_is_too_short_is_refused_with_what_takes_so_long_and_the_time_that_
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_what_is_too_far_for_any_time_is_refused() -> None:
     with pytest.raises(FollowError, match="too far"):
-        shortest_from_rest(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), (0.0, 0.0, 0.0), BENCH)
+        shortest_from_rest(Trajectory.of(Hold(attitude=(0.0, 0.0, 1e308))), (0.0, 0.0, 0.0), BENCH)
 
 
 def test_a_way_that_tilts_further_than_both_its_ends_is_refused_as_no_time_would_help() -> None:
     """Beyond the horizontal a straight line of roll and pitch may pass through a larger tilt."""
     limits = BODY._replace(tilt=radians(120))
     start, target = (130.0, 50.0, 0.0), Hold(attitude=(130.0, -130.0, 0.0))
-    Plan.of(target).check(limits)
+    Trajectory.of(target).check(limits)
     with pytest.raises(FollowError, match=r"the approach tilts by 130\.0°, more than .*, however long it takes"):
-        shortest_from_rest(Plan.of(target), start, limits)
+        shortest_from_rest(Trajectory.of(target), start, limits)
 
 
 # Rest
@@ -293,12 +297,12 @@ def test_a_way_that_tilts_further_than_both_its_ends_is_refused_as_no_time_would
 @given(history=histories)
 def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Reference, float, float]]) -> None:
     followed, t = after(history, BODY)
-    angle, rate, acceleration = states(followed.plan, t)
+    angle, rate, acceleration = states(followed.trajectory, t)
     rest = followed.motion.rest(t, BODY)
     assert rest.attitude is not None
     away = np.abs(np.radians(rest.attitude) - angle)
     assert np.all(away <= stopping(here((angle, rate, acceleration)), BODY.braking) + 1e-9)
-    approach = shortest(Plan.of(rest), followed.motion.here(t), BODY)
+    approach = shortest(Trajectory.of(rest), followed.motion.here(t), BODY)
     assert approach.within_s == pytest.approx(max(approach.brake_s or (0.0,)) + LEAST_TURN_S)
     followed.approach(rest, t, approach)
     for later in (approach.within_s + 1e-9, 9.0 + approach.within_s):
@@ -314,29 +318,29 @@ def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Re
 def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
     start: Hold, target: Hold, asked_s: float, rate: float
 ) -> None:
-    plan, limits = Plan.of(target), NO_LIMITS._replace(rate=rate)
-    begin = Plan.of(start).first
-    approach = to_set_point(plan, begin, asked_s, limits)
+    trajectory, limits = Trajectory.of(target), NO_LIMITS._replace(rate=rate)
+    begin = Trajectory.of(start).first
+    approach = to_set_point(trajectory, begin, asked_s, limits)
     assert approach.brake_s is None  # a single quintic
-    asked = approached(plan, begin, 0.0, Approach(asked_s)).fastest()
+    asked = approached(trajectory, begin, 0.0, Approach(asked_s)).fastest()
     if asked <= rate:
         assert approach.within_s == asked_s
     else:
         # Rates fall as the time grows: the least is asked_s · asked / rate, and 5 % more is what is taken at once.
         assert approach.within_s == pytest.approx(asked_s * asked / rate * 1.05, rel=1e-9)
-        assert approached(plan, begin, 0.0, approach).fastest() <= rate
+        assert approached(trajectory, begin, 0.0, approach).fastest() <= rate
 
 
 @settings(max_examples=50)
 @given(start=any_states(), target=turns.map(lambda a: Hold(attitude=a)), asked_s=seconds(0.02, 2.0))
 def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hold, asked_s: float) -> None:
     """Beyond its start or its target, no further than braking within the time asked, or within the limit, would."""
-    plan = Plan.of(target)
+    trajectory = Trajectory.of(target)
     assume(Angles(*start).speeds().max() <= BODY.rate)
-    approach = to_set_point(plan, start, asked_s, BODY)
-    angles, _, _ = way(approached(plan, start, 0.0, approach), plan, approach.within_s)
+    approach = to_set_point(trajectory, start, asked_s, BODY)
+    angles, _, _ = way(approached(trajectory, start, 0.0, approach), trajectory, approach.within_s)
     within = np.abs(start.rate[0]) * asked_s / 2 + np.abs(start.acceleration[0]) * asked_s**2 / 12
     margin = np.maximum(stopping(start, BODY.braking), within) + 2e-3  # between two of 65 samples
-    ends = np.concatenate([start.angle, plan.first.angle])
+    ends = np.concatenate([start.angle, trajectory.first.angle])
     assert np.all(ends.min(axis=0) - margin <= angles)
     assert np.all(angles <= ends.max(axis=0) + margin)

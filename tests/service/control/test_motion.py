@@ -25,7 +25,7 @@ from aeroloop.protocol.messages.operator import (
     Stream,
 )
 from aeroloop.service.control.motion import Approach, Motion, approached
-from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
+from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
 from tests.support.numpy_twin import Array, Sinusoids
 
 EPS: Final = 2.0**-52
@@ -62,19 +62,19 @@ sinusoids = st.builds(Sinusoid, amplitude=triples(60), frequency=st.tuples(frequ
 references: st.SearchStrategy[Reference] = st.one_of(holds, sinusoids, some_points())
 withins = seconds(0.02, 5.0)
 
-# A second opinion of a plan
+# A second opinion of a trajectory
 
 
-def states(plan: Plan, t: float, *, before: bool = False) -> tuple[Array, Array, Array]:
+def states(trajectory: Trajectory, t: float, *, before: bool = False) -> tuple[Array, Array, Array]:
     """Angle, rate, acceleration, each of shape (3,), term by term; on a join, of the piece after it unless `before`."""
-    begun = [i for i, start in enumerate(plan.starts) if (start < t if before else start <= t)]
-    return piece_states(plan, begun[-1] if begun else 0, t)
+    begun = [i for i, start in enumerate(trajectory.starts) if (start < t if before else start <= t)]
+    return piece_states(trajectory, begun[-1] if begun else 0, t)
 
 
-def piece_states(plan: Plan, i: int, t: float | Array) -> tuple[Array, Array, Array]:
+def piece_states(trajectory: Trajectory, i: int, t: float | Array) -> tuple[Array, Array, Array]:
     """As above, of one piece, wherever t lies; of many times at once if they are of shape (m, 1)."""
-    tau, c = t - plan.starts[i], plan.quintic[i]
-    a, f = plan.amplitude[i], plan.frequency[i]
+    tau, c = t - trajectory.starts[i], trajectory.quintic[i]
+    a, f = trajectory.amplitude[i], trajectory.frequency[i]
     powers = range(6)
     return (
         sum((c[n] * tau**n for n in powers), a * np.sin(f * tau)),
@@ -103,22 +103,22 @@ def desired_of(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     return Now(np.zeros(3), np.zeros(3)).desired(0.0)
 
 
-def terms(plan: Plan, i: int, t: float, order: int) -> float:
+def terms(trajectory: Trajectory, i: int, t: float, order: int) -> float:
     """The sum over three axes of the terms of a derivative of piece i at time t, whatever their signs."""
-    tau, c = abs(t - plan.starts[i]), np.abs(plan.quintic[i])
+    tau, c = abs(t - trajectory.starts[i]), np.abs(trajectory.quintic[i])
     polynomial = sum(math.perm(n, order) * c[n] * tau ** (n - order) for n in range(order, 6))
-    return float((polynomial + np.abs(plan.amplitude[i]) * plan.frequency[i] ** order).sum())
+    return float((polynomial + np.abs(trajectory.amplitude[i]) * trajectory.frequency[i] ** order).sum())
 
 
 # A motion that is watched
 
 
 class Followed:
-    """A motion, and what its plan should be by Plan's own word."""
+    """A motion, and what its trajectory should be by Trajectory's own word."""
 
     def __init__(self, reference: Reference) -> None:
         self.motion = Motion(reference)
-        self.plan = Plan.of(reference)
+        self.trajectory = Trajectory.of(reference)
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """q_d, ω_d, ω̇_d as the loop reads them."""
@@ -126,13 +126,13 @@ class Followed:
         return q_d, omega_d, omega_d_dot
 
     def follow(self, reference: Reference, t: float, within_s: float) -> None:
-        """Follow something else, and know the plan of that."""
+        """Follow something else, and know the trajectory of that."""
         self.approach(reference, t, Approach(within_s))
 
     def approach(self, reference: Reference, t: float, approach: Approach) -> None:
         """The same, by any approach."""
-        self.plan = approached(Plan.of(reference), here(states(self.plan, t)), t, approach)
-        self.motion.follow(Plan.of(reference), t, approach)
+        self.trajectory = approached(Trajectory.of(reference), here(states(self.trajectory, t)), t, approach)
+        self.motion.follow(Trajectory.of(reference), t, approach)
 
 
 def rounding(around: Sequence[tuple[Array, Array, Array]], t: float, within_s: float) -> Array:
@@ -162,7 +162,7 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
     for reference, passed, within_s in changes:
         t += passed
         before = followed.at(t)
-        now = states(followed.plan, t)
+        now = states(followed.trajectory, t)
         followed.follow(reference, t, within_s)
         # At τ = 0 only c₀, c₁ and 2·c₂ count, which are the state itself; the products of three turns round on.
         tolerance = 100 * EPS * (1 + np.abs(now).max()) ** 2
@@ -215,12 +215,12 @@ def test_points_are_passed_each_at_its_time_from_rest_to_rest(
 @settings(max_examples=40)
 @given(points=some_points())
 def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> None:
-    plan = Plan.of(points)
+    trajectory = Trajectory.of(points)
     gaps = np.diff(points.times)
-    for i, (start, gap) in enumerate(zip(plan.starts[1:], gaps, strict=True)):
-        before, there = piece_states(plan, i, plan.starts[i]), piece_states(plan, i + 1, start)
+    for i, (start, gap) in enumerate(zip(trajectory.starts[1:], gaps, strict=True)):
+        before, there = piece_states(trajectory, i, trajectory.starts[i]), piece_states(trajectory, i + 1, start)
         tolerance = rounding([before, there], float(start), float(gap)) + 1e-300
-        for order, (left, right) in enumerate(zip(piece_states(plan, i, start), there, strict=True)):
+        for order, (left, right) in enumerate(zip(piece_states(trajectory, i, start), there, strict=True)):
             assert np.abs(left - right).max() <= tolerance[order]
 
 
@@ -243,17 +243,17 @@ def test_the_loops_function_gives_the_plans_own_angles(
         if pending and t >= pending[0][1]:
             reference, _, within_s = pending.pop(0)
             followed.follow(reference, t, within_s)
-        plan, i = followed.plan, followed.plan.piece(t)
-        taken = plan.at(np.full((len(plan.starts), 1), t - plan.starts[i]))
+        trajectory, i = followed.trajectory, followed.trajectory.piece(t)
+        taken = trajectory.at(np.full((len(trajectory.starts), 1), t - trajectory.starts[i]))
         state = tuple(part[i, 0] for part in taken)
-        rate, acceleration = terms(plan, i, t, 1), terms(plan, i, t, 2)
+        rate, acceleration = terms(trajectory, i, t, 1), terms(trajectory, i, t, 2)
         for order, (got, expected) in enumerate(
             zip(followed.at(t), desired_of((state[0], state[1], state[2])), strict=True)
         ):
             # Either way the terms round by EPS some fifty times: of angles below 10, rates and accelerations.
             size = (10.0, 10 * (1 + rate), 10 * (1 + rate) ** 2 + acceleration)[order]
             assert np.abs(got - expected).max() <= 200 * EPS * size
-        for got, expected in zip(state, piece_states(plan, i, t), strict=True):
+        for got, expected in zip(state, piece_states(trajectory, i, t), strict=True):
             assert np.abs(got - expected).max() <= 200 * EPS * (10 + rate + acceleration)
 
 
@@ -289,9 +289,9 @@ def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
     reference: Reference, limits: Limits, why: str
 ) -> None:
     with pytest.raises(FollowError, match=why) as refused:
-        Plan.of(reference).check(limits)
+        Trajectory.of(reference).check(limits)
     assert len(str(refused.value).splitlines()) == 1
-    Plan.of(reference).check(NO_LIMITS)
+    Trajectory.of(reference).check(NO_LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -309,20 +309,20 @@ def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
     ],
 )
 def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limits: Limits) -> None:
-    Plan.of(reference).check(limits)
+    Trajectory.of(reference).check(limits)
 
 
 def test_a_sinusoid_that_is_too_fast_only_after_many_periods_is_refused() -> None:
     """Nearly equal frequencies: roll and yaw oppose each other at the steepest pitch within an hour, not before."""
-    plan = Plan.of(Sinusoid(amplitude=(60.0, 50.0, 80.0), frequency=(0.4, 0.4006, 0.4002)))
+    trajectory = Trajectory.of(Sinusoid(amplitude=(60.0, 50.0, 80.0), frequency=(0.4, 0.4006, 0.4002)))
     first, hour = (
-        Angles(*(part[0] for part in plan.at(np.arange(0, seconds, 0.05)[None]))).speeds().max()
+        Angles(*(part[0] for part in trajectory.at(np.arange(0, seconds, 0.05)[None]))).speeds().max()
         for seconds in (8 * 2 * pi / 0.4, 3600)
     )
-    assert first < 0.86 < hour <= plan.fastest() < 1.03 * hour
-    plan.check(BODY._replace(tilt=pi))
+    assert first < 0.86 < hour <= trajectory.fastest() < 1.03 * hour
+    trajectory.check(BODY._replace(tilt=pi))
     with pytest.raises(FollowError, match="max_reference_rate"):
-        plan.check(BODY._replace(tilt=pi, rate=0.86))
+        trajectory.check(BODY._replace(tilt=pi, rate=0.86))
 
 
 DENSE: Final = 30 * 64 + 1
@@ -338,12 +338,12 @@ direction that is fastest at any time is such a quartic."""
 @given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
 def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
     """Without roll, where Σ rate² is all; from any state, so from any acceleration."""
-    angle, rate, acceleration = (part * [0.0, 1.0, 1.0] for part in states(Plan.of(first), t))
+    angle, rate, acceleration = (part * [0.0, 1.0, 1.0] for part in states(Trajectory.of(first), t))
     assert target.attitude is not None
-    level = Plan.of(Hold(attitude=(0.0, *target.attitude[1:])))
-    plan = approached(level, here((angle, rate, acceleration)), t, Approach(within_s))
-    _, rates, _ = piece_states(plan, 0, t + within_s * np.linspace(0, 1, DENSE)[:, None])
+    level = Trajectory.of(Hold(attitude=(0.0, *target.attitude[1:])))
+    trajectory = approached(level, here((angle, rate, acceleration)), t, Approach(within_s))
+    _, rates, _ = piece_states(trajectory, 0, t + within_s * np.linspace(0, 1, DENSE)[:, None])
     fastest = np.linalg.norm(rates, axis=1).max()
     # 1e-9: rounding of terms 15 (5/T) times the angles, at most 400, that cancel; in what is hardly moving, too.
-    assert plan.fastest() <= fastest * (1 + 1e-9) + 1e-9
-    assert fastest <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES + 1e-9
+    assert trajectory.fastest() <= fastest * (1 + 1e-9) + 1e-9
+    assert fastest <= trajectory.fastest() * QUARTIC_BETWEEN_SAMPLES + 1e-9

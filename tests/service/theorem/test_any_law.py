@@ -11,7 +11,7 @@ import pytest
 from aeroloop import ExpressionLaw, LawSettings
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.theorem.certificate import OwnCertificate, certificate_of, certify, described_certificate
+from aeroloop.service.theorem.certificate import CustomCertificate, certificate_of, certify, described_certificate
 from aeroloop.service.theorem.feedback import NoTheoremError
 
 HERE = "tests.service.theorem.test_any_law"
@@ -84,7 +84,7 @@ def test_without_a_certificate_one_line_says_why(kind: str, line: str) -> None:
 
 def test_an_own_certificate_keeps_what_the_law_says() -> None:
     found = certificate_of(load(overrides=[f"law.kind={HERE}:Silent"]))
-    assert isinstance(found, OwnCertificate)
+    assert isinstance(found, CustomCertificate)
     assert found.model_extra == {"decay_rate": 0.5}
 
 

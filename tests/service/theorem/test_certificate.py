@@ -19,7 +19,7 @@ from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.reference import Plan, reference_function
+from aeroloop.service.control.reference import Trajectory, reference_function
 from aeroloop.service.theorem.bounds import Samples, Theorem, attitude_error, coordinates, lemma_inequalities, rotation
 from aeroloop.service.theorem.certificate import RESOLUTION_S, Evaluated, certify, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
@@ -308,19 +308,19 @@ def test_no_attitude_errs_by_more_than_k_eps_says_and_some_by_nearly_as_much(bit
     ids=["paper", "three axes", "points"],
 )
 def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(reference: Reference) -> None:
-    bounds, plan, function = (
+    bounds, trajectory, function = (
         extremes(PAPER.model_copy(update={"reference": reference})),
-        Plan.of(reference),
+        Trajectory.of(reference),
         Compiled(reference_function()),
     )
     most = np.zeros(6)
     times, step = np.linspace(0, 6.5 if isinstance(reference, Points) else 140, 5000, retstep=True)
     last: np.ndarray[Any, Any] | None = None
     for t in times.tolist():
-        i = plan.piece(t)
+        i = trajectory.piece(t)
         for name in ("quintic", "amplitude", "frequency"):
-            function.inputs[name][:] = memoryview(getattr(plan, name)[i].ravel().copy())
-        function.inputs["start"][0], function.inputs["t"][0] = plan.starts[i], t
+            function.inputs[name][:] = memoryview(getattr(trajectory, name)[i].ravel().copy())
+        function.inputs["start"][0], function.inputs["t"][0] = trajectory.starts[i], t
         function()
         rate, acceleration = (hypot(*function.outputs[name]) for name in ("omega_d", "omega_d_dot"))
         q_d, omega_d = function.outputs["q_d"], function.outputs["omega_d"]

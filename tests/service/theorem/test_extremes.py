@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.service.config import load_over
-from aeroloop.service.control.reference import Angles, Floats, Plan
+from aeroloop.service.control.reference import Angles, Floats, Trajectory
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import body_rates, chords, extremes, feedforward, half_angles, vectors
 from tests.support.certified import bits, certified_settings
@@ -54,7 +54,7 @@ def bounds(reference: Sinusoid) -> Floats:
 )
 def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step_s: float, duration_s: float) -> None:
     """At least once through every beat; the first four were exceeded by up to 33 % after some periods."""
-    run = Plan.of(reference).at(np.arange(0, duration_s, step_s)[None])
+    run = Trajectory.of(reference).at(np.arange(0, duration_s, step_s)[None])
     reached, allowed = largest(reference, Angles(*(part[0] for part in run))), bounds(reference)
     assert np.all(reached <= allowed)
     if reference in (PAPER, LOCKED):  # the others' frequencies have a common multiple, too, if a large one
@@ -73,7 +73,7 @@ def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_
         phases[::2] = np.round(phases[::2] / (pi / 2)) * pi / 2 + 0.1 * (
             phases[::2] - pi
         )  # many extremes are near these
-        reached = np.maximum(reached, largest(reference, Plan.of(reference).swing(phases)))
+        reached = np.maximum(reached, largest(reference, Trajectory.of(reference).swing(phases)))
     assert np.all(reached <= allowed)
     assert np.all(reached >= 0.85 * allowed)  # a random search misses what is narrow
 
@@ -91,7 +91,7 @@ def test_no_attitude_along_the_reference_errs_by_more_than_its_chord() -> None:
         settings = certified_settings().model_copy(update={"reference": reference})
         delta, error = 0.004, 0.05
         bound = chords(extremes(settings), delta)(error)
-        eps = vectors(Plan.of(reference).swing(rng.uniform(0, 2 * pi, (50_000, 3)) if reference is UNEVEN else
+        eps = vectors(Trajectory.of(reference).swing(rng.uniform(0, 2 * pi, (50_000, 3)) if reference is UNEVEN else
                                                rng.uniform(0, 2 * pi, (50_000, 1)) * [0, 2, 1]))  # fmt: skip
         turn = rng.standard_normal((50_000, 3))
         turn *= 2 * np.sin(error / 2) * 0.99 / np.linalg.norm(turn, axis=1, keepdims=True) * rng.random((50_000, 1))

@@ -14,7 +14,7 @@ from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.interface import ExpressionLaw, Now
 from aeroloop.service.control.laws.registry import law_of
-from aeroloop.service.control.reference import Angles, Floats, Plan
+from aeroloop.service.control.reference import Angles, Floats, Trajectory
 from aeroloop.service.theorem.bounds import coordinates, rotation, times
 from aeroloop.service.theorem.certificate import premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
@@ -97,7 +97,7 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     at = reach(p, 0.005)
     assert at is not None
     J, B, period = np.array(law.inertia), np.array(law.allocation), settings.loop.period
-    desired = Angles(*(part[0] for part in Plan.of(settings.reference).at(rng.uniform(0, 40, n)[None])))
+    desired = Angles(*(part[0] for part in Trajectory.of(settings.reference).at(rng.uniform(0, 40, n)[None])))
     b, b_dot = body_rates(desired)
     q_d = with_scalar(vectors(desired))
     theta = np.array(p.law.centre) + balls(rng, p.law.radius, n)
@@ -253,16 +253,16 @@ def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bound
     at = reach(p, 0.02)
     assert at is not None
     J, B = np.array(law.inertia), np.array(law.allocation)
-    plan, rng, step, n = Plan.of(settings.reference), np.random.default_rng(7), 1e-6, 20_000
+    trajectory, rng, step, n = Trajectory.of(settings.reference), np.random.default_rng(7), 1e-6, 20_000
     theta = np.repeat(np.array(p.law.centre) + balls(rng, p.law.radius, 10), n // 10, axis=0)
     theta_hat = np.array(p.law.centre) + balls(rng, p.law.reach, n)
     t = rng.uniform(0, 40, n)
-    planned = Angles(*(part[0] for part in plan.at(t[None])))
+    planned = Angles(*(part[0] for part in trajectory.at(t[None])))
     error = rng.uniform(-1, 1, (n, 4)) * [2 * at.eps_e, 2 * at.eps_e, at.omega_e, at.omega_e]
     x = np.hstack([planned.angle[:, 1:], planned.rate[:, 1:]]) + error
 
     def coordinates(t: Floats, x: Floats, theta_hat: Floats) -> tuple[Floats, ...]:
-        desired = Angles(*(part[0] for part in plan.at(t[None])))
+        desired = Angles(*(part[0] for part in trajectory.at(t[None])))
         b, b_dot = body_rates(desired)
         q_d = with_scalar(vectors(desired))
         (pitch, yaw, pitch_rate, yaw_rate), o = x.T, np.zeros(len(x))

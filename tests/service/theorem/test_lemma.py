@@ -19,7 +19,7 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.reference import Floats, Plan, reference_function
+from aeroloop.service.control.reference import Floats, Trajectory, reference_function
 from aeroloop.service.theorem.bounds import Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from aeroloop.service.theorem.certificate import Paper, evaluate
 from tests.support import numpy_twin as twin
@@ -77,7 +77,7 @@ def turns(axis: Floats, angle: Floats) -> Floats:
 def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats]:
     """States along the reference, as far from it as was assumed, and what the law receives of them; and ω̇_d."""
     rng = np.random.default_rng(seed)
-    motion, desired = Compiled(reference_function()), Plan.of(REFERENCE)
+    motion, desired = Compiled(reference_function()), Trajectory.of(REFERENCE)
     rows = []
     for name in ("amplitude", "frequency"):
         motion.inputs[name][:] = memoryview(getattr(desired, name)[0].copy())

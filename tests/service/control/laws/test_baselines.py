@@ -18,7 +18,7 @@ from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gains, response_of, riccati, tuned
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.registry import OwnLawSettings, law_of, own_settings
+from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
@@ -42,7 +42,7 @@ class Body:
 
     def __init__(self, kind: str, rng: np.random.Generator, **fields: Any) -> None:
         B = (rng.normal(size=(3, 3)) + 3 * np.eye(3)) / 10  # well away from singular
-        body = OwnLawSettings(
+        body = CustomLawSettings(
             kind=kind,
             inertia=tuple(rng.uniform(0.5, 2, 3)),
             mass=rng.uniform(0.5, 2),
@@ -51,8 +51,8 @@ class Body:
         )
         self.response = Response(tuple(rng.uniform(1, 3, 3)), tuple(rng.uniform(0.75, 1.5, 3)))
         known = {"damping_estimate": tuple(rng.uniform(0, 0.1, 3))}
-        section = OwnLawSettings(**body.model_dump() | tuned(kind, body, self.response) | known | fields)
-        self.p: Any = own_settings(section)
+        section = CustomLawSettings(**body.model_dump() | tuned(kind, body, self.response) | known | fields)
+        self.p: Any = law_settings(section)
         law: Any = law_of(section, PERIOD, 3)
         self.function = law_function(law)
         self.gains = [value for gain in configured_gains(law).values() for value in gain]

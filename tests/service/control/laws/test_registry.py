@@ -14,7 +14,7 @@ from aeroloop.protocol.plugins import PluginError
 from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import Adaptive
-from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, own_settings, with_gains
+from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, law_settings, with_gains
 from aeroloop.service.lab.experiment import experiment
 from tests.support import failing_laws
 from tests.support.failing_laws import FAILING
@@ -139,7 +139,7 @@ def test_an_entry_point_of_the_group_is_found_by_its_name(monkeypatch: pytest.Mo
     assert type(law("ours")) is Expressions
     assert ", ours, " in refused("theirs")
     assert type(law("adaptive")) is Adaptive
-    assert own_settings(load(overrides=["law.kind=ours"]).law).kind == "ours"
+    assert law_settings(load(overrides=["law.kind=ours"]).law).kind == "ours"
 
 
 SOURCE = """from aeroloop.service.control.laws.interface import LawSettings, PythonLaw
