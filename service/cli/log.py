@@ -27,8 +27,8 @@ from aeroloop.service.cli.processes import run_alone
 if TYPE_CHECKING:
     from threading import Event
 
+    from aeroloop.service.logs.copies import Recovery
     from aeroloop.service.logs.export import Exported
-    from aeroloop.service.logs.recover import Recovery
     from aeroloop.service.review.report import Report
     from aeroloop.service.terminal.show import Sheets
 
@@ -186,7 +186,7 @@ def recover(
     json: Json = False,
 ) -> None:
     """Copy what is whole of a broken log into a new one. Reports what was lost."""
-    from aeroloop.service.logs.recover import recover
+    from aeroloop.service.logs.copies import recover
 
     def sheets(recovery: Recovery) -> Sheets:
         found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"

@@ -23,6 +23,7 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
+from aeroloop.service.logs.copies import write_decoded
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import SessionKey, Unknown
@@ -96,14 +97,12 @@ def export(
         with writing(out, paths, force=force) as part:
             recording = Recording(paths, progress)
             if to == "mcap":
-                from aeroloop.service.logs.decoded_log import write_decoded
-
                 if (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
                     raise ExportError(
                         "--session, --vehicle, --from and --to choose the rows of a table; --format mcap writes all of "
                         "the log"
                     )
-                rows, columns, damages = write_decoded(recording, part, progress or (lambda _: None))
+                rows, columns, damages = write_decoded(recording, part, progress)
             else:
                 first = recording.choose(None if session == ALL else session, vehicle)
                 chosen = recording.sessions_of(first[0]) if session == ALL else [first]
@@ -121,7 +120,7 @@ def export(
         bytes=size,
         damages=damages,
         unknown=[one for one in recording.unknown if f"{one.vehicle}/{one.session}" in (sessions or ())],
-        left_out=sorted({"/".join(which) for which in recording.extents}.difference(sessions)) if sessions else [],
+        left_out=[name for name in map("/".join, recording.extents) if sessions and name not in sessions],
     )
 
 

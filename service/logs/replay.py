@@ -8,7 +8,7 @@ the log's plant does not respond to that, so it is no simulation.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from math import inf, sqrt
 from pathlib import Path
 from typing import Literal
@@ -25,8 +25,8 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Missing, Session, SessionKey, Source, Unknown
-from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows, levels
+from aeroloop.service.logs.session import Missing, SessionKey, Source, Unknown
+from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -239,8 +239,6 @@ def _replay_session(
         if was_as == now_as == Sent.FRAME:
             signals = [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
             details = in_units(wire.command, signals, was, now)
-        again = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
-        details += _held_before(again, session, first)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],
@@ -253,25 +251,6 @@ def _replay_session(
         u_total_logged=added(0.0, squares(before)) * period,
         u_total_computed=added(0.0, squares(after)) * period,
     ), details
-
-
-def _held_before(again: LoggedController, session: Session, first: int) -> list[str]:
-    """What both ends held before a row of the controller, in words."""
-    columns = [session.controller[name][:first] for name in ("tick", "received_as", "measurement")]
-    for i, row in enumerate(in_rows(columns)):
-        again.resume(i)
-        again.answer(*row)
-    again.resume(first)
-    state = again.controller.state
-    law = "; ".join(f"{name} = {_numbers(values)}" for name, values in state.law.items())
-    sent = state.sent_codes or state.voltage_codes
-    volts = "none" if sent is None else _numbers(levels(again.controller.wire.voltage, np.array(sent))) + " V"
-    lines = [f"the controller held q = {_numbers(state.attitude)}; {law}; command {volts}"]
-    before = np.flatnonzero(session.plant["session_tick"] <= session.controller["tick"][first])
-    if len(before):
-        row = session.plant[before[-1]]
-        lines.append(f"the plant held {_numbers(row['voltages'])} V at its tick {row['session_tick']}")
-    return lines
 
 
 # ── The plant ──
@@ -352,7 +331,3 @@ def in_units(
             was_v, now_v = (f"{x:g}{unit}" if x == x else "no valid value" for x in map(quantizer.level, (a, b)))
             lines.append(f"{name}: {was_v} logged, {now_v} computed{steps}")
     return lines
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return f"[{', '.join(f'{value:.6g}' for value in values)}]"

@@ -21,9 +21,9 @@ from mcap.reader import make_reader
 from mcap.records import Message
 
 from aeroloop.protocol.transport.history import Delivery
+from aeroloop.service.logs.copies import RecoverError, recover
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.mcap_file import messages
-from aeroloop.service.logs.recover import RecoverError, recover
 from aeroloop.service.recording import rolling
 from aeroloop.service.settings import RecorderSettings
 from tests.support.made_log import make_log

@@ -21,6 +21,7 @@ from mcap.records import Channel, Chunk, Message
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.logs.copies import RecoverError, recover
 from aeroloop.service.logs.mcap_file import (
     DESCRIPTION_METADATA,
     MAX_CHUNK,
@@ -31,7 +32,6 @@ from aeroloop.service.logs.mcap_file import (
 )
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
-from aeroloop.service.logs.recover import RecoverError, recover
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import read as read_run
 from aeroloop.service.review.review import review

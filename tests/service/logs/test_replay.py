@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from math import inf
 from pathlib import Path
 
@@ -53,12 +52,10 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
         bytes.fromhex(text) for text in (session.first_difference.logged, session.first_difference.computed)
     )
     assert logged[-1] ^ computed[-1] == 0x10
-    signal, controller, plant = both.details["controller"]
+    (signal,) = both.details["controller"]
     volts = [signal.split()[i] for i in (1, 4)]
     steps = abs(float(volts[0]) - float(volts[1])) / (48 / 63)  # (2·y_max)/(2^R − 1)
     assert signal == f"u3: {volts[0]} V logged, {volts[1]} V computed, {steps:.0f} steps apart"
-    assert re.fullmatch(r"the controller held q = .*; damping_estimate = .*; command \[.*\] V", controller)
-    assert re.fullmatch(r"the plant held \[.*\] V at its tick 321", plant)
     assert "details" not in both.model_dump()
 
 

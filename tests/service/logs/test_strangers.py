@@ -13,8 +13,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.logs.copies import recover
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.recover import recover
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.report.page import page
 from aeroloop.service.review.compare import read_runs

@@ -18,8 +18,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
+from aeroloop.service.logs.copies import recover
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, Damage, records, with_checksum
-from aeroloop.service.logs.recover import recover
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
 from aeroloop.service.settings import RecorderSettings

@@ -1,0 +1,151 @@
+"""Copies of a log: what can be read of a broken one, and a run with every message decoded.
+
+A copy has its own ids; messages keep their topic, schema, times and sequence. What several files repeat is written
+once: schemas, channels, attachments, and a metadata record that equals the last one of its name and key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import Writer
+from pydantic import BaseModel, Field
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, Damage, NotMcapError, records
+from aeroloop.service.logs.outputs import writing
+from aeroloop.service.logs.recording import Progress, Recording
+
+if TYPE_CHECKING:  # recovery needs no decoder
+    from aeroloop.service.viewers.channels import Decoder
+
+
+class RecoverError(AeroloopError):
+    """Nothing can be recovered; one line with the reason."""
+
+
+class Recovery(BaseModel, frozen=True):
+    """What was recovered."""
+
+    out: str
+    messages: int
+    channels: int
+    lost: list[str] = Field(description="what could not be read, a line each; empty if the file was whole")
+
+
+class Copied(NamedTuple):
+    """How many messages were written, their topics, and what of each file could not be read."""
+
+    messages: int
+    topics: list[str]
+    damages: list[tuple[Path, Damage]]
+
+
+def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
+    """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
+
+    Raises:
+        OutputError: The new file must not be written, or cannot.
+        RecoverError: It is not an MCAP file, or cannot be read.
+    """
+    try:
+        broken.stat()
+        with writing(out, [broken], force=force) as part:
+            copied = _copy([broken], part, "aeroloop log recover", progress)
+            if not copied.messages:
+                raise RecoverError(f"{broken} holds no whole message")
+    except NotMcapError as error:
+        raise RecoverError(f"{error}, so there is nothing to recover") from None
+    except OSError as error:
+        raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
+    lost = [str(damage) for _, damage in copied.damages]
+    return Recovery(out=str(out), messages=copied.messages, channels=len(copied.topics), lost=lost)
+
+
+def write_decoded(
+    recording: Recording, out: Path, progress: Progress | None = None
+) -> tuple[int, list[str], list[str]]:
+    """Write a run as one log with every message decoded, which the recorder does at a bounded rate only.
+
+    Returns:
+        How many messages were written, their topics, and what of the log could not be read, a line each.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    from aeroloop.service.viewers.channels import Decoder
+
+    decoder = Decoder(rate_hz=None)
+    for description in recording.descriptions.values():
+        decoder.configure(description)
+    copied = _copy(recording.paths, out, "aeroloop log export", progress, decoder)
+    damages = [f"{path}: {damage.what}" for path, damage in copied.damages]
+    if decoder.malformed:
+        damages.append(f"malformed: {decoder.malformed} of what is decoded")
+    return copied.messages, copied.topics, damages
+
+
+def _copy(
+    paths: Sequence[Path], out: Path, program: str, progress: Progress | None, decoder: Decoder | None = None
+) -> Copied:
+    """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
+
+    Raises:
+        NotMcapError: A file is not an MCAP file.
+        OSError: A file cannot be read, or the new one cannot be written.
+    """
+    messages, damages, done = 0, list[tuple[Path, Damage]](), 0
+    size = max(1, sum(path.stat().st_size for path in paths))
+    names, attachments, last = set[str](), set[tuple[str, bytes]](), dict[tuple[str, str | None], dict[str, str]]()
+    with out.open("wb") as file:
+        writer = Writer(file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        writer.start(profile="aeroloop", library=program)
+        schema_id = cache(writer.register_schema)
+
+        @cache
+        def channel_id(topic: str, encoding: str, schema: int, metadata: Iterable[tuple[str, str]] = ()) -> int:
+            names.add(topic)
+            return writer.register_channel(topic, encoding, schema, dict(metadata))
+
+        for path in paths:
+            found, schemas, channels = list[Damage](), {0: 0}, dict[int, tuple[int, str]]()  # by the ids of this file
+
+            def report(read: int, before: int = done) -> None:
+                if progress is not None:
+                    progress((before + read) / size)
+
+            for record in records(path, found, report):
+                match record:
+                    case Message() if record.channel_id in channels:
+                        channel, topic = channels[record.channel_id]
+                        writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+                        address = topics.read_key(topic) if decoder else None
+                        decoded = decoder.take(address, record.data, record.publish_time) if decoder and address else []
+                        for topic, shape, data, at_ns in decoded:  # log time is that of publication, as recorded
+                            schema = schema_id(shape.name, shape.encoding, shape.schema)
+                            channel = channel_id(topic, shape.message_encoding, schema)
+                            writer.add_message(channel, at_ns, data, at_ns)
+                        messages += 1 + len(decoded)
+                    case Schema():
+                        schemas[record.id] = schema_id(record.name, record.encoding, record.data)
+                    case Channel(id_, topic, encoding, metadata, schema) if not (decoder and topic.startswith("/")):
+                        known = channel_id(topic, encoding, schemas.get(schema, 0), tuple(metadata.items()))
+                        channels[id_] = known, topic
+                    case Metadata(name=name, metadata=entries) if last.get((name, entries.get("key"))) != entries:
+                        last[name, entries.get("key")] = entries
+                        writer.add_metadata(name, entries)
+                    case Attachment(created, logged, name, kind, data) if (name, data) not in attachments:
+                        attachments.add((name, data))
+                        writer.add_attachment(created, logged, name, kind, data)
+            done += path.stat().st_size
+            damages += [(path, damage) for damage in found]
+        for (name, _), entries in last.items():  # descriptions also stand at the end, as the recorder writes them
+            if name == DESCRIPTION_METADATA:
+                writer.add_metadata(name, entries)
+        writer.finish()
+    return Copied(messages, sorted(names), damages)
