@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.control.laws.registry import LawError
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
 from tests.support.numpy_twin import Sinusoids
@@ -100,5 +101,5 @@ def test_three_actuators_on_a_plant_with_two_do_not_make_a_loop() -> None:
 def test_a_law_that_cannot_be_inverted_does_not_make_a_loop() -> None:
     settings = Settings()
     law = settings.law.model_copy(update={"allocation": ((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 1.0))})
-    with pytest.raises(ValueError, match=r"law\.allocation"):
+    with pytest.raises(LawError, match=r"law\.allocation"):
         run_experiment(settings.model_copy(update={"law": law}), 0.1)

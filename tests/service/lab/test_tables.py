@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import chain
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from tests.support.in_this_process import workers_here
 pytestmark = pytest.mark.processes
 
 BENCH = load()
-README = Path(__file__).parents[3] / "service" / "README.md"
+README = Path(__file__).parents[3] / "service" / "lab" / "README.md"
 
 
 def run_cell(cell: Cell, settings: Settings = BENCH) -> tuple[float, float]:
@@ -119,8 +120,8 @@ def test_only_the_scored_cell_counts_and_figures_are_averaged() -> None:
     assert additive.mare_left_out == pytest.approx(((119 - sums[0]) / 119 + (9699 - sums[1]) / 9699) / 2)
 
 
-def test_the_readme_shows_every_row_that_the_command_prints(tables: Tables) -> None:
-    text = README.read_text(encoding="utf-8")
+def test_every_row_of_the_readme_is_printed_by_the_command(tables: Tables) -> None:
     printed = [f"| {' | '.join(row.values())} |" for _, rows in sheets(tables) for row in rows]
-    assert len(printed) == 6 + 6 + 2 + 5
-    assert [line for line in printed if line not in text] == []
+    shown = re.findall(r"^\| (?:\d+|cont) \|.*$", README.read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(shown) == 4
+    assert set(shown) <= set(printed)

@@ -1,10 +1,7 @@
-"""`hil` without processes: errors before `start`, settings, figures of an ended run, evidence of a failure, types."""
+"""`hil` without processes: errors before `start`, settings, figures of an ended run, evidence of a failure."""
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,13 +9,9 @@ import pytest
 from aeroloop.protocol.messages.models import Event
 from aeroloop.service.config import as_overrides, load
 from aeroloop.service.review.review import review
-from aeroloop.service.testing import hil as hil_module
 from aeroloop.service.testing.hil import Hil, HilError, HilLog
 from aeroloop.service.testing.hil_log import RunFigures
 from tests.support.made_log import make_log
-
-ROOT = Path(__file__).parents[3]
-README = Path(hil_module.__file__).with_name("README.md")
 
 VERBS = {
     "run": (1.0,),
@@ -96,19 +89,3 @@ def test_evidence_of_a_log_that_cannot_be_read_names_the_reason_and_has_the_even
         "7)",
     ]
     assert list(HilLog(tmp_path / "b.mcap").evidence([event])) == [f"{tmp_path / 'b.mcap'}: no log was written"]
-
-
-def test_the_readmes_example_passes_strict_mypy(tmp_path: Path) -> None:
-    examples = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    assert examples
-    (tmp_path / "test_example.py").write_text("\n\n".join(examples))
-    command = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--config-file",
-        "pyproject.toml",
-        str(tmp_path / "test_example.py"),
-    ]  # strict
-    checked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stdout
