@@ -54,7 +54,7 @@ def _check(settings: Settings) -> None:
 
 @group.command()
 def api() -> None:
-    """List the names of the Python package, with their arguments or fields."""
+    """List the names of the Python package, with arguments or fields."""
     from aeroloop import research
 
     for name in research.__all__:

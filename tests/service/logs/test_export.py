@@ -326,7 +326,7 @@ def test_the_command_names_the_sessions_that_it_leaves_out(
 ) -> None:
     for session, left_out in (("1", SHORT), ("2", SESSION), ("all", None)):
         out = str(tmp_path / f"{session}.csv")
-        assert execute(["log", "export", str(log), "--to", "csv", "--out", out, "--session", session]) == 0
+        assert execute(["log", "export", str(log), "--format", "csv", "--out", out, "--session", session]) == 0
         printed = capfd.readouterr().out
         assert (f"not exported of this log: {VEHICLE}/{left_out};" in printed) == bool(left_out)
         assert ("not exported" in printed) == bool(left_out)
