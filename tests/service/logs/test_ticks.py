@@ -208,7 +208,9 @@ def test_a_log_that_takes_more_memory_than_there_is_is_refused_with_what_to_do(
     make_log(tmp_path / "a.mcap", 600)
     session = Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION))
     monkeypatch.setattr(recording_module, "available_bytes", lambda: 300_000)
-    with pytest.raises(ReviewError, match=r"600 ticks take .* GiB of memory, .* `aeroloop log review` and `aeroloop log export` read"):
+    with pytest.raises(
+        ReviewError, match=r"600 ticks take .* GiB of memory, .* `aeroloop log review` and `aeroloop log export` read"
+    ):
         recompute(session)
 
 
