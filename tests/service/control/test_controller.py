@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
+from aeroloop.plant_emulator.model.emulated import SUBSTEPS
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, sent_vector
@@ -20,6 +20,7 @@ from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from tests.support import ideal
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -158,8 +159,8 @@ def test_the_sign_is_that_of_the_first_error_and_stays() -> None:
 
 def test_the_closed_loop_agrees_with_the_twins() -> None:
     """Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick."""
-    aero = IDEAL_AERO
-    plant = PlantSettings(ideal=True).build(PERIOD)
+    aero = ideal.AERO
+    plant = ideal.PLANT.build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, PERIOD_NS, lockstep=True)
     claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, auto_arm=True, wire=CONTINUOUS)
     assert isinstance(endpoint.claim(claim), Grant)
@@ -182,7 +183,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
         _, sent = _answer(CONTINUOUS, command)
         assert sent == pytest.approx(held, rel=5e-11, abs=5e-11)
         measurement = endpoint.tick(command, k + 1)
-        body.advance(held, PERIOD, PlantSettings().substeps)
+        body.advance(held, PERIOD, SUBSTEPS)
         assert plant.truth().attitude == pytest.approx(body.q, abs=1e-12)
         assert plant.truth().rate == pytest.approx(body.omega, abs=1e-12)
     assert limited > 0  # the start is hard enough to meet the limits, which are part of what is compared

@@ -21,6 +21,7 @@ from aeroloop.service.control.laws.evaluation import configured_gains, initial_s
 from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin
+from tests.support.ideal import IDEAL
 from tests.support.numpy_twin import Array
 
 BASELINES = [*TUNED, "nonadaptive"]
@@ -264,7 +265,7 @@ def test_without_quantization_the_ideal_plant_follows_the_reference(kind: str, p
 
 
 def ideal(kind: str, overrides: tuple[str, ...]) -> Settings:
-    settings = load(overrides=[f"law.kind={kind}", "plant.ideal=true", *overrides])
+    settings = load(overrides=[f"law.kind={kind}", *IDEAL, *overrides])
     return settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
 
 
