@@ -34,8 +34,8 @@ BRAKING: Final = 1.0
 """Largest acceleration with which roll, pitch and yaw each brake before a motion and run up to a reference that moves
 [rad/s²]; from the rate v an axis stops within 0.75 v². The Aero's motors turn it by 2.4 rad/s² in pitch at 24 V."""
 START_WITHIN_DEG: Final = 20.0
-"""A session that begins further than this from its reference first approaches it smoothly; from nearer the law gets there
-before a motor has been at its limit for the second after which the Aero trips [deg]."""
+"""A session that begins further than this from its reference first approaches it smoothly [deg]; from nearer the law
+gets there before a motor has been at its limit for the second after which the Aero trips."""
 LEAST_TURN_S: Final = 0.02
 """Least time of the turn [s], however small it is."""
 LET_GO_S: Final = 0.1
