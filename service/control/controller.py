@@ -191,13 +191,15 @@ class Controller:
         self.set_gains(Gains.model_validate(gains))
         self.restore(ControllerSnapshot(law={name: tuple(values) for name, values in state.items()}))
 
-    def tick(self, frame: bytes, k: int) -> bytes | None:
-        """Answer the measurement of tick k: a frame, or UNCHANGED if its levels have not changed.
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Answer the measurement of tick k: a frame, UNCHANGED if its levels have not changed, or None for none.
 
         Returns:
-            The command frame; UNCHANGED if it would repeat the last one; None for malformed bytes. A measurement
-            without a valid value is answered by a command without one: the plant then goes to 0 V.
+            The command frame; UNCHANGED if it would repeat the last one; None for no measurement and malformed bytes.
+            A measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
         """
+        if frame is None:
+            return None
         read = self._read(frame)
         if read is not None:
             counter, self._held = read

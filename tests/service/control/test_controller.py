@@ -46,6 +46,7 @@ def test_malformed_bytes_are_counted_and_leave_no_trace(bits: str) -> None:
     for k, junk in enumerate((b"", frame[:-1], frame + b"\0", padding)):
         assert controller.tick(junk, k) is None
         assert controller.refused == k + 1
+    assert controller.tick(None, 8) is None
     assert controller.tick(frame, 9) == untouched.tick(frame, 9)
     assert controller.refused == 4
 
