@@ -112,6 +112,11 @@ def _expressions_function(wire: WireSpec, law: type[ExpressionLaw[Any]], setting
 # ── the controller ──
 
 
+def _last(name: str) -> Any:
+    """A property of the controller: an output at the last valid tick."""
+    return property(lambda self: tuple(self.last_valid[name]))
+
+
 class ControllerSnapshot(BaseModel):
     """State carried from tick to tick, besides reference and gains. Its JSON keeps every bit of the floats.
 
@@ -151,6 +156,19 @@ class Controller:
         LawError: The law cannot be used, such as one for another number of actuators.
         PluginError: There is no such law.
     """
+
+    attitude: Quaternion = _last("q")
+    """q^Q of the last measurement [1]."""
+    rate: Vector = _last("omega")
+    """ω^Q of the last measurement, body frame [rad/s]."""
+    desired: Quaternion = _last("q_d")
+    """q_d at the last measurement [1]."""
+    attitude_error: Vector = _last("eps_e")
+    """ε̃ at the last measurement [1]."""
+    rate_error: Vector = _last("omega_e")
+    """ω_e at the last measurement, body frame [rad/s]."""
+    voltages: tuple[float, ...] = _last("u")
+    """The last u before quantization [V]. Shape (actuators,)."""
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
         self.wire = wire
@@ -332,36 +350,6 @@ class Controller:
     def law_state(self) -> dict[str, tuple[float, ...]]:
         """The law's named state after the last measurement."""
         return {name: tuple(part) for name, part in self._state.items()}
-
-    @property
-    def attitude(self) -> Quaternion:
-        """q^Q of the last measurement [1]."""
-        return tuple(self.last_valid["q"])  # type: ignore[return-value]  # four elements
-
-    @property
-    def rate(self) -> Vector:
-        """ω^Q of the last measurement, body frame [rad/s]."""
-        return tuple(self.last_valid["omega"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def attitude_error(self) -> Vector:
-        """ε̃ at the last measurement [1]."""
-        return tuple(self.last_valid["eps_e"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def rate_error(self) -> Vector:
-        """ω_e at the last measurement, body frame [rad/s]."""
-        return tuple(self.last_valid["omega_e"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def desired(self) -> Quaternion:
-        """q_d at the last measurement [1]."""
-        return tuple(self.last_valid["q_d"])  # type: ignore[return-value]  # four elements
-
-    @property
-    def voltages(self) -> list[float]:
-        """The last u before quantization [V]. Shape (actuators,)."""
-        return list(self.last_valid["u"])
 
     @property
     def saturated(self) -> int:

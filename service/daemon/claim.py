@@ -136,9 +136,10 @@ class ClaimClient:
         models: tuple[type[Grant | Refusal | Answer], ...] = Grant, Refusal, Answer
         key = topics.key("claim", self._role.vehicle)
         for reply in self._role.zenoh.get(key, payload=claim.encode(), timeout=ANSWER_WAIT_S):
-            for model in models if reply.ok else ():
+            payload = reply.ok.payload.to_bytes() if reply.ok else b""
+            for model in models:
                 with suppress(MessageError):
-                    read = model.decode(reply.ok.payload.to_bytes())
+                    read = model.decode(payload)
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 

@@ -108,7 +108,8 @@ class OperatorChanges:
     def _prepare_track(self, track: Track) -> Callable[[], Answer]:
         source: Source = "configured" if track.reference is None else "operator"
         reference = track.reference or self._configured
-        trajectory = self._check(reference)
+        trajectory = Trajectory.of(reference)
+        trajectory.check(self._limits)
         self._running()
         return lambda: self._track(reference, trajectory, track.within_s, source)
 
@@ -138,11 +139,8 @@ class OperatorChanges:
             approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
         self.setpoints.begin()
-        self._follow(held, trajectory, approach)
-        stream = reference if isinstance(reference, Stream) else held
-        self._update_record(reference=stream, reference_from=source, since_tick=self._k, **approach._asdict())
         text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
-        self._role.event("changed", text, self.record.session, self._k)
+        self._approach(held, trajectory, approach, text, reference, source)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
     # ── a session's start and end ──
@@ -175,7 +173,7 @@ class OperatorChanges:
             return
         reference = rest_of_reference(last, self._running().period)
         try:
-            self._check(reference)
+            Trajectory.of(reference).check(self._limits)
             with_gains(self._law, last.gains)
             gains = last.gains.over(self.record.gains)
         except (FollowError, LawError) as error:
@@ -189,7 +187,7 @@ class OperatorChanges:
             self._present_reference = Hold()  # until the first set-point
 
     def _begin_with(self, reference: Reference, source: Source, within_s: float = 0.0) -> None:
-        """Begin the next session with a reference; a hold without attitude holds the attitude found."""
+        """A hold without attitude holds the attitude found."""
         self._present_reference = reference
         self._update_record(reference=reference, reference_from=source, **Approach(within_s)._asdict())
 
@@ -219,15 +217,12 @@ class OperatorChanges:
             approach = shortest_from_rest(trajectory, nearest_turn(start, trajectory), limits)
             approach = approach.at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
-        self._follow(target, trajectory, approach)
-        stream = self.record.reference if isinstance(self.record.reference, Stream) else target
-        self._update_record(reference=stream, since_tick=self._k, **approach._asdict())
-        self._role.event("changed", text, self.record.session, self._k)
+        self._approach(target, trajectory, approach, text, self.record.reference, self.record.reference_from)
 
     # ── in the loop ──
 
     def before_tick(self, k: int, frame: bytes) -> None:
-        """Apply the changes received since the last tick, from tick k on. The frame is the measurement of that tick."""
+        """Apply the changes received since the last tick, from tick k on; `frame` is the measurement of that tick."""
         self._k = k
         if not self._started_near:
             self._start_near(frame)
@@ -253,16 +248,19 @@ class OperatorChanges:
             return
         self._follow(hold, trajectory, approach)
 
+    def _approach(
+        self, to: Reference, trajectory: Trajectory, approach: Approach, text: str, asked: Reference, source: Source
+    ) -> None:
+        """Follow from this tick on; the record has it, or the stream that was asked for."""
+        self._follow(to, trajectory, approach)
+        reference = asked if isinstance(asked, Stream) else to
+        self._update_record(reference=reference, reference_from=source, since_tick=self._k, **approach._asdict())
+        self._role.event("changed", text, self.record.session, self._k)
+
     def _follow(self, reference: Reference, trajectory: Trajectory, approach: Approach) -> None:
         self._running().motion.follow(trajectory, self._time, approach)
         self._present_reference = reference
         self._record_change(reference=reference, **approach._asdict())
-
-    def _check(self, reference: Reference) -> Trajectory:
-        """The reference's trajectory, which takes time. Raises FollowError beyond the limits."""
-        trajectory = Trajectory.of(reference)
-        trajectory.check(self._limits)
-        return trajectory
 
     @property
     def _time(self) -> float:

@@ -229,10 +229,8 @@ class Session:
     def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
         """Add a row to the trace. A command that repeats the last one is silent, in lockstep too."""
         sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
-        if command is None:
-            sent_ns = 0
-        tick = max(now.tick, 0)
-        row = ControllerRow(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        times = now.at_ns, 0 if command is None else sent_ns
+        row = ControllerRow(max(now.tick, 0), now.received_as, sent_as, *times, now.frame, command or b"")
         self._shared.trace.row(row)
         self._publish_trace_when_due()
 
@@ -253,7 +251,6 @@ class Session:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self.name, now.tick)
 
     def _advance_state(self, tick: int, fault: str | None) -> None:
-        """Move the state machine after an answer."""
         machine, role = self._shared.machine, self._role
         if fault is not None:
             machine.fire(Trigger.FAULT)
@@ -281,7 +278,7 @@ def telemetry_of(controller: Controller, session: str) -> Telemetry:
         rate_error=controller.rate_error,
         desired=controller.desired,
         state=controller.law_state,
-        voltages=tuple(controller.voltages),
+        voltages=controller.voltages,
     )
 
 

@@ -114,7 +114,7 @@ def run_from(bits: str, q: Array, omega: Array, first_tick: int, seconds: float)
         frames.append(measurement)
         true, theta = plant.truth().attitude, controller.law_state["damping_estimate"]
         command = controller.tick(measurement, k)
-        state = theta, tuple(controller.voltages), controller.law_state["sign"]
+        state = theta, controller.voltages, controller.law_state["sign"]
         rows.append((true, controller.attitude, *desired(k), *state))
         measurement = endpoint.tick(command, k + 1 - first_tick)
     assert endpoint.accepted == len(frames)
