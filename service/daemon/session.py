@@ -49,8 +49,8 @@ STALL_TICKS: Final = 10
 TELEMETRY_HZ: Final = 10.0
 """Telemetry is for people: the trace has every tick [Hz]."""
 LAW_TIMEOUT_S: Final = 0.1
-"""A tick of the law that takes longer faults the controller, except in lockstep: as long as the plant's watchdog, so
-its command would be the first after 0 V [s]."""
+"""A tick of the law that takes longer faults the controller, except in lockstep [s]. By then the plant's watchdog, with
+its default time, has set 0 V."""
 REPORT_S: Final = 1.0
 """A tick that lasts longer is reported while it lasts [s]."""
 STOP_S: Final = 2.0
