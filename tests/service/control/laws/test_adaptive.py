@@ -67,11 +67,11 @@ def _point(rng: np.random.Generator, p: AdaptiveSettings, share: float = 1.0) ->
 
 def _random_settings(rng: np.random.Generator) -> AdaptiveSettings:
     """A body and gains that have nothing in common with Table C.1."""
-    uniform = {"inertia": (0.5, 2.0, 3), "mass": (0.5, 2.0), "gravity": (5.0, 10.0), "damping_bound": (0.1, 2.0)}
-    uniform |= dict.fromkeys(("C1", "C2", "Gamma"), (0.1, 2.0, 3))
-    drawn = {name: rng.uniform(*limits) for name, limits in uniform.items()}
+    body = {"inertia": rng.uniform(0.5, 2, 3), "mass": rng.uniform(0.5, 2), "gravity": rng.uniform(5, 10)}
+    body |= {"centre_of_mass": rng.normal(size=3), "damping_bound": rng.uniform(0.1, 2)}
+    gains = {name: rng.uniform(0.1, 2, 3) for name in ("C1", "C2", "Gamma")}
     allocation = rng.normal(size=(3, 3)) + 3 * np.identity(3)  # + 3 I: well away from singular
-    return AdaptiveSettings.model_validate({**drawn, "centre_of_mass": rng.normal(size=3), "allocation": allocation})
+    return AdaptiveSettings.model_validate({**body, **gains, "allocation": allocation})
 
 
 def _array(value: ca.DM) -> Array:
