@@ -12,8 +12,8 @@ import pytest
 from aeroloop.protocol.wire.spec import Kind
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import ConfigError, Settings, load, load_over, with_bits
+from aeroloop.service.lab.engine import run_of
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.lab.sweep import run_of
 from aeroloop.service.lab.tables import Cell
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import Recording
