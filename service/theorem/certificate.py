@@ -440,9 +440,7 @@ def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) ->
     law = e.plant.law
     found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
     paper = (
-        [
-            f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}° (controller.start_within_deg)"
-        ]
+        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}° (start_within_deg)"]
         if e.paper
         else []
     )
