@@ -104,8 +104,8 @@ def design(
             f"no design of {tried} is proven to stay within {error_deg:g}°"
             f"{f' at up to {kbit:g} kbit/s' if kbit else ''}: allow more, or other rates (--rate)"
         )
-    sent = ([], ["wire.transmit=on_change"])
-    runs = [run_of(settings, [*point.overrides(), *change]) for point in front for change in sent]
+    sent = ("wire.transmit=periodic", "wire.transmit=on_change")
+    runs = [run_of(settings, [*point.overrides(), each]) for point in front for each in sent]
     with open_workers(engine) as workers:
         rows = workers.rows(partial(figures_row, duration_s=duration_s), runs, lambda n: progress(n, len(runs)))
     simulated = zip(front, rows[::2], rows[1::2], strict=True)
@@ -122,9 +122,9 @@ def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | N
         split = base.model_copy(update={"wire": base.wire.with_bits(str(bits))})
         p = premises(split, desired, bounds, 0.0, late_s)
         at = reach(p)
-        found.append(
-            at
-            and Point(
+        point = None
+        if at is not None:
+            point = Point(
                 kbit_s=round(payload, 3),
                 rate_hz=base.loop.rate_hz,
                 bits=str(bits),
@@ -132,7 +132,7 @@ def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | N
                 degrees=degrees(2 * asin(at.eps_e)),
                 beyond=[name for *_, name in beyond(split, desired, p, at)],
             )
-        )
+        found.append(point)
     return found
 
 

@@ -111,7 +111,7 @@ class Workers(NamedTuple):
     """Workers that do a function of a configuration."""
 
     executor: Executor
-    count: int
+    cores: int
 
     def stream(self, work: Callable[[Settings], Result], runs: Sequence[Run]) -> Iterator[tuple[int, Result]]:
         """Number and result of each run, as they finish.
@@ -126,7 +126,7 @@ class Workers(NamedTuple):
         """
         pending, sent = dict[Future[Result], int](), 0
         while pending or sent < len(runs):
-            while sent < len(runs) and len(pending) < 2 * self.count:  # none waits for its next, few are in memory
+            while sent < len(runs) and len(pending) < 2 * self.cores:  # none waits for its next, few are in memory
                 pending[self.executor.submit(_done, code_version(), work, runs[sent])] = sent
                 sent += 1
             for future in wait(pending, return_when=FIRST_COMPLETED).done:

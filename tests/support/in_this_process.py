@@ -25,9 +25,9 @@ class InThisProcess(Executor):
         return future
 
 
-def workers_here(count: int = 1) -> Workers:
-    """Workers in this process; with a count above one their results come in no order."""
-    return Workers(InThisProcess(), count)
+def workers_here(cores: int = 1) -> Workers:
+    """Workers in this process; with several cores their results come in no order."""
+    return Workers(InThisProcess(), cores)
 
 
 @contextmanager

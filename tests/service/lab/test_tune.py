@@ -70,8 +70,8 @@ def model(monkeypatch: pytest.MonkeyPatch, of: Callable[[float, Case], Row]) -> 
     return asked
 
 
-def found(settings: Settings, options: TuneOptions, progress: Progress = lambda *_: None, count: int = 1) -> Tuning:
-    return tune.tune(settings, options, workers_here(count), progress)
+def found(settings: Settings, options: TuneOptions, progress: Progress = lambda *_: None, cores: int = 1) -> Tuning:
+    return tune.tune(settings, options, workers_here(cores), progress)
 
 
 def test_a_law_whose_optimum_is_known_comes_near_it() -> None:
@@ -112,7 +112,7 @@ def test_the_search_never_sees_what_is_held_out(modelled: Asked) -> None:
 
 
 def test_the_same_is_found_in_whatever_order_runs_end(modelled: Asked) -> None:
-    assert found(own("Offset"), FEW) == found(own("Offset"), FEW, count=8)
+    assert found(own("Offset"), FEW) == found(own("Offset"), FEW, cores=8)
     assert modelled
 
 
