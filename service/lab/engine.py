@@ -27,7 +27,7 @@ from contextlib import contextmanager
 from functools import cache, lru_cache
 from hashlib import sha256
 from importlib.metadata import version
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -180,11 +180,15 @@ def local_processes() -> Iterator[Workers]:
     """A process a core, forked from a server that has imported what they need and has no threads."""
     count, context = os.cpu_count() or 1, multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
+    resource_tracker.ensure_running()  # it ends with SIGINT unblocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the server and its workers inherit it
     try:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    first = context.Process(target=int)  # waits for the server's imports: ^C must not meet a worker that starts
+    first.start()
+    first.join()
     with ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as executor:
         try:
             yield Workers(executor, count)
