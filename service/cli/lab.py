@@ -130,7 +130,7 @@ def burden(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Measure error against bits, for every quantizer and four kinds of sensors. Sent on change and at every tick."""
+    """Measure error against bits, for every quantizer and sensor. Sent on change and at every tick."""
     settings = loop_of(config, overrides)
     from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
 
