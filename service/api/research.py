@@ -30,12 +30,12 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.lab import experiment
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review import review
-from aeroloop.service.testing.hil import Hil
+from aeroloop.service.testing.hil import Hil, HilError
 from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Certificate
 
 __all__ = [
-    "AeroloopError", "Certificate", "Controller", "ExpressionLaw", "Figures", "Gain", "Gains3", "Hil",
+    "AeroloopError", "Certificate", "Controller", "ExpressionLaw", "Figures", "Gain", "Gains3", "Hil", "HilError",
     "HysteresisQuantizer", "LawSettings", "LogarithmicQuantizer", "Measurement", "Now", "Plant", "PositiveGain",
     "PythonLaw", "RecordedRun", "Settings", "SignalSpec", "State", "Ticks", "UniformQuantizer", "WireSpec", "certify",
     "gravity_torque", "load_settings", "read_run", "run_experiment", "voltages_for",

@@ -5,7 +5,7 @@ pytest --hil-lockstep test_lockstep_hil.py
 
 from __future__ import annotations
 
-from aeroloop.service.testing.hil import Hil
+from aeroloop import Hil
 
 
 def test_a_dead_motor_does_not_trip_the_plant(hil: Hil) -> None:

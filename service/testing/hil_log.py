@@ -9,20 +9,22 @@ from typing import Any, Literal
 
 from mcap.reader import make_reader
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
-from aeroloop.service.figures import Figures
-from aeroloop.service.review.review import report, review
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.review import read, report
 from aeroloop.service.testing.process_group import HilError
+from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
 
 
 @dataclass(frozen=True)
 class RunFigures:
-    """Figures of merit of a run that has ended; reading one that its log lacks raises HilError."""
+    """What `aeroloop log review --json` says of a session; reading a figure that its log lacks raises HilError."""
 
-    found: Figures
+    found: Findings
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.found, name)
@@ -39,8 +41,15 @@ class HilLog:
 
     @property
     def figures(self) -> RunFigures:
-        """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
-        return RunFigures(review(self._existing()))
+        """Figures of the longest session, from the log alone; its `sessions` says how many there are."""
+        return self.figures_of(None)
+
+    def figures_of(self, session: int | None) -> RunFigures:
+        """Figures of a session, by its number from 1 in the order of recording. Raises HilError if there is none."""
+        try:
+            return RunFigures(read(self._existing(), session=None if session is None else str(session)).findings)
+        except AeroloopError as error:
+            raise HilError(str(error)) from None
 
     @property
     def events(self) -> list[Event]:

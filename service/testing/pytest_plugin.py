@@ -82,6 +82,6 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Add the evidence of a failed test's loop to its report, while the loop's folder is still there."""
     report = yield
-    if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) is not None:
-        report.sections.append(("hil", "\n".join(loop.evidence())))
+    if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) and (lines := loop.evidence()):
+        report.sections.append(("hil", "\n".join(lines)))
     return report

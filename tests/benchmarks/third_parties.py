@@ -7,7 +7,6 @@ of as many undisturbed stretches of the same length.
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from subprocess import Popen
+from typing import Any
 
 from tests.support.namespaces import Hosts
 
@@ -30,17 +30,10 @@ TRIALS = 10
 Parties = dict[str, Popen[bytes]]
 
 
-class Seen:
-    """Statuses and events in the file that a watcher on the plant's host writes."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def totals(self) -> tuple[int, int]:
-        """Sessions lost, and ticks skipped by both ends so far."""
-        lines = [json.loads(line) for line in self._path.read_text().splitlines() if line.endswith("}")]
-        skipped = {line["role"]: line["skipped"] for line in lines if "skipped" in line}
-        return sum(line.get("kind") == "tripped" for line in lines), skipped["plant"] + skipped["controller"]
+def totals(seen: list[dict[str, Any]]) -> tuple[int, int]:
+    """Sessions lost, and ticks skipped by both ends so far, by statuses and events."""
+    skipped = {line["role"]: line["skipped"] for line in seen if "skipped" in line}
+    return sum(line.get("kind") == "tripped" for line in seen), skipped["plant"] + skipped["controller"]
 
 
 def main(trials: int) -> None:
@@ -49,8 +42,7 @@ def main(trials: int) -> None:
         folder = Path(name)
         hosts.aeroloop("plant", "plant")
         hosts.aeroloop("controller", "controller", "--auto-arm")
-        hosts.watch("plant", folder / "seen")
-        seen, logs = Seen(folder / "seen"), count()
+        seen, logs = hosts.watch("plant"), count()
 
         def recorder(host: str = "third") -> Popen[bytes]:
             return hosts.aeroloop(host, "recorder", "--log", str(folder / f"{next(logs)}.mcap"))
@@ -113,10 +105,10 @@ def main(trials: int) -> None:
             time.sleep(2 * SETTLE_S)
             lost, skipped = [], []
             for _ in range(trials):
-                before = seen.totals()
+                before = totals(seen())
                 happens(parties)
                 time.sleep(SETTLE_S)
-                after = seen.totals()
+                after = totals(seen())
                 lost.append(after[0] - before[0])
                 skipped.append(after[1] - before[1])
             for party in parties.values():

@@ -61,7 +61,16 @@ def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
 
 
 PUBLIC = {
-    *("AeroloopError", "Certificate", "Controller", "Figures", "Hil", "HysteresisQuantizer", "LogarithmicQuantizer"),
+    *(
+        "AeroloopError",
+        "Certificate",
+        "Controller",
+        "Figures",
+        "Hil",
+        "HilError",
+        "HysteresisQuantizer",
+        "LogarithmicQuantizer",
+    ),
     *(
         "Measurement",
         "Plant",
