@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mcap.reader import make_reader
+from mcap.records import Channel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
+from aeroloop.service.logs.mcap_file import messages
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, report
 from aeroloop.service.testing.process_group import HilError
@@ -86,14 +88,16 @@ class HilLog:
 
         Frames and traces are bytes.
         """
-        found: list[tuple[int, Message | bytes]] = []
         topic = topics.TOPICS[name]
-        with self._existing().open("rb") as file:
-            for _, channel, message in make_reader(file).iter_messages():
-                address = topics.read_key(channel.topic)
-                if address is not None and address.topic is topic:
-                    content = topic.model.model_validate_json(message.data) if topic.model else message.data
-                    found.append((message.publish_time, content))
+
+        def wanted(channel: Channel) -> bool | None:
+            address = topics.read_key(channel.topic)
+            return True if address is not None and address.topic is topic else None
+
+        found = [
+            (message.publish_time, topic.model.model_validate_json(message.data) if topic.model else message.data)
+            for _, message in messages(self._existing(), wanted)
+        ]
         return sorted(found, key=lambda each: each[0])
 
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:
@@ -107,11 +111,11 @@ class HilLog:
             return
         yield f"{self.path}: the log"
         events, shown = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
-        try:
+        timed: list[tuple[int, Event]] = []
+        with suppress(Exception):  # whatever a broken log makes its reader raise
             timed = [(at, event) for at, event in self.messages("event") if isinstance(event, Event)]
-            lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
-        except Exception:  # whatever a broken log makes its reader raise
-            lines = [_line(event) for event in received]
+        lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
+        lines = lines or [_line(event) for event in received]
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:

@@ -207,13 +207,11 @@ class ProcessGroup:
             drive: Whether to start a controller, which claims once both are there.
             environment: As of `start_command`.
         """
-        node = self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast"
-        roles: list[RoleName] = [
-            "recorder",
-            *(["can-node"] if node else []),
-            "plant",
-            *(["controller"] if drive else []),
-        ]
+        roles: list[RoleName] = ["recorder", "plant"]
+        if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
+            roles.insert(1, "can-node")
+        if drive:
+            roles.append("controller")
         for role in roles:
             self.start(role, environment=environment)
         self.await_role("recorder")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -14,10 +13,12 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Release
 from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Request
+from aeroloop.protocol.transport.network_settings import SecuritySettings
+from aeroloop.service.host.operator import OperatorError, gather, stop
 from aeroloop.service.testing.hil import Hil
 from tests.support.certificates import Authority
 from tests.support.certified_link import open_session
-from tests.support.processes import PATIENT, aeroloop
+from tests.support.processes import PATIENT
 from tests.support.zenoh_network import eventually
 
 
@@ -30,25 +31,24 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
     foreign.issue("operator")
     keys = {"network.security.directory": str(ours.folder), "network.loopback_secured": True}
     hil.start(settings={**PATIENT, **keys})
-
-    def op(*words: str, keys: Path | None, code: int | None = 0) -> str:
-        secured = [f"network.security.directory={keys}", "network.loopback_secured=true"] if keys else []
-        overrides = [f"network.rendezvous={json.dumps(hil.settings.network.rendezvous)}", *secured]
-        return aeroloop("op", *words, *(word for override in overrides for word in ("--set", override)), code=code)
+    network = hil.settings.network
 
     def well() -> bool:
-        found = json.loads(op("status", "--json", keys=ours.folder, code=None) or "{}").get("aero", {})
-        assert all(status["certificate_until"] for status in found.values())
-        states = {role: status["state"] for role, status in found.items()}
-        return states == {"controller": "running", "plant": "driven", "recorder": "recording"}
+        with suppress(OperatorError):
+            statuses = gather(network).statuses["aero"]
+            assert all(status.certificate_until for status in statuses.values())
+            states = {role: status.state for role, status in statuses.items()}
+            return states == {"controller": "running", "plant": "driven", "recorder": "recording"}
+        return False
 
-    hil.eventually("a status of each", lambda: len(hil.processes.statuses) == 3)
-    eventually("the status of all", well)
-    for stranger in (foreign.folder, None):
-        assert len(op("stop", keys=stranger, code=1).splitlines()) == 1
-    assert "not of this authority" in op("status", keys=foreign.folder, code=1)
+    hil.eventually("the status of all", well)
+    for security in (network.security.model_copy(update={"directory": str(foreign.folder)}), SecuritySettings()):
+        stranger = network.model_copy(update={"security": security, "loopback_secured": security.folder is not None})
+        assert stop(stranger).answers == []
+        with pytest.raises(OperatorError, match="not of this authority" if security.folder else "no role answers"):
+            gather(stranger)
     assert not hil.happened("tripped")
-    op("stop", keys=ours.folder)
+    hil.stop()
     hil.eventually("the stop", lambda: hil.happened("tripped", "stopped by an operator"))
 
 
