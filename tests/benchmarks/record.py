@@ -21,7 +21,7 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.service.config import load
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 from tests.benchmarks.loop import cpu_s
-from tests.support.made_messages import VEHICLE, Ends
+from tests.support.made_log import VEHICLE, made
 
 FLOOD_PER_S = 20_000
 FLOOD_S = 10.0
@@ -30,8 +30,8 @@ PUBLISHERS = 2
 
 def flood(rendezvous: str, vehicle: str) -> None:
     """Publish telemetry, 20 messages at a time; in a process of its own."""
-    said = (said.payload for said in Ends(load()).tick(0, 1, 1) if said.topic == "telemetry")
-    payload, rate_hz = next(said), FLOOD_PER_S / PUBLISHERS
+    payload = next(message.payload for message in made(load(), 20) if message.key.endswith("/telemetry"))
+    rate_hz = FLOOD_PER_S / PUBLISHERS
     with join(load(overrides=[f"network.rendezvous={rendezvous}"]).network) as session:
         publisher = CachedPublisher(session, topics.key("telemetry", vehicle), rate_hz, lossless=True)
         start = time.monotonic()
