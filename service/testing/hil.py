@@ -87,6 +87,7 @@ class Hil:
         log = self._folder / f"hil-{len(self._logs)}.mcap"
         ours = {
             "network.rendezvous": free_rendezvous(),
+            "network.mode": "peer",
             "recorder.path": str(log),
             "recorder.max_file_mb": 1e6,  # a test reads one file
             "recorder.max_file_s": 1e6,

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from mcap.records import Channel
 
@@ -20,6 +20,8 @@ from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, report
 from aeroloop.service.testing.process_group import HilError
 from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
+
+M = TypeVar("M", bound=Message)
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,21 @@ class HilLog:
     @property
     def events(self) -> list[Event]:
         """Events in order."""
-        return [message for _, message in self.messages("event") if isinstance(message, Event)]
+        return [event for _, event in self.messages(Event)]
 
     @property
     def trips(self) -> list[str]:
         """Cause of each trip of the plant, in order."""
         return [event.text for event in self.events if event.kind == "tripped"]
 
+    def messages(self, model: type[M]) -> list[tuple[int, M]]:
+        """Messages of one kind, such as `Truth`, with their times of publication [ns], in that order."""
+        topic = next(topic for topic in topics.TOPICS.values() if topic.model is model)
+        return [(at_ns, model.model_validate_json(content)) for at_ns, content in self._published(topic)]
+
     def batches(self, end: End) -> list[Batch]:
-        """Trace batches of one end, in the order of recording."""
-        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
+        """Trace batches of one end, in the order of publication."""
+        read = [read_batch(content) for _, content in self._published(topics.TOPICS["trace"])]
         return [batch for batch in read if batch is not None and batch.header.end == end]
 
     def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
@@ -83,21 +90,12 @@ class HilLog:
         """Changes of references and gains that controllers applied, in order."""
         return [change for batch in self.batches("controller") for change in batch.tail.changes]
 
-    def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
-        """Time of publication [ns] and content of every message of one topic, by that time, of equal ones as recorded.
-
-        Frames and traces are bytes.
-        """
-        topic = topics.TOPICS[name]
-
+    def _published(self, topic: topics.Topic) -> list[tuple[int, bytes]]:
         def wanted(channel: Channel) -> bool | None:
             address = topics.read_key(channel.topic)
             return True if address is not None and address.topic is topic else None
 
-        found = [
-            (message.publish_time, topic.model.model_validate_json(message.data) if topic.model else message.data)
-            for _, message in messages(self._existing(), wanted)
-        ]
+        found = [(message.publish_time, message.data) for _, message in messages(self._existing(), wanted)]
         return sorted(found, key=lambda each: each[0])
 
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:
@@ -113,7 +111,7 @@ class HilLog:
         events, shown = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
         timed: list[tuple[int, Event]] = []
         with suppress(Exception):  # whatever a broken log makes its reader raise
-            timed = [(at, event) for at, event in self.messages("event") if isinstance(event, Event)]
+            timed = self.messages(Event)
         lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
         lines = lines or [_line(event) for event in received]
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -31,13 +31,12 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status, Telemetry
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import POLL_S, join
+from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.probe import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 
-RoleName = Literal["controller", "plant", "can-node", "recorder", "router"]
+RoleName = Literal["controller", "plant", "can-node", "recorder"]
 """In the order of stopping."""
 
 PRELOADED: Final = (
@@ -148,7 +147,7 @@ def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
     controller = {"require_recorder": True, "auto_arm": True, "after_restart": "configured", **controller}
     return settings.model_copy(
         update={
-            "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()]}),
+            "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()], "mode": "peer"}),
             "controller": settings.controller.model_copy(update=controller),
             "can": private_bus(settings.can),
             "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
@@ -160,8 +159,7 @@ class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
     Their configuration and output, a text file each, are kept in the folder if one is given; `zenoh` is a session on
-    their network. Clients get a router of their own. The last status of each role, every event and the last telemetry
-    are collected as they are received.
+    their network. The last status of each role, every event and the last telemetry are collected as they are received.
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:
@@ -180,11 +178,6 @@ class ProcessGroup:
         self.statuses: dict[str, Status] = {}
         self.events: list[Event] = []
         self.telemetry: Telemetry | None = None
-        if settings.network.mode == "client":
-            self.start("router")
-            while not accepting(settings.network.rendezvous_endpoints):
-                self.check()
-                time.sleep(POLL_S)
         self.zenoh = join(settings.network)  # listens, so that a process links to it as it starts
         for topic in ("status", "event", "telemetry"):
             self.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), self._receive)

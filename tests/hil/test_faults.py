@@ -30,7 +30,7 @@ FAST_TRUTH = {"plant.truth_rate_hz": 500}
 
 def seconds_driven_after(log: HilLog, moment_ns: int) -> float:
     """How long after a moment the motors still had a voltage [s]; the plant must publish at least once after it."""
-    truths = [(at, truth) for at, truth in log.messages("truth") if isinstance(truth, Truth)]
+    truths = log.messages(Truth)
     driven = [at for at, truth in truths if any(truth.voltages)]
     assert driven, "the motors never had a voltage, so nothing is shown"
     assert not any(truths[-1][1].voltages), "the motors still have a voltage at the end of the log"
@@ -39,7 +39,7 @@ def seconds_driven_after(log: HilLog, moment_ns: int) -> float:
 
 def events(log: HilLog, *kinds: str) -> list[tuple[int, Event]]:
     """Events of some kinds with their times [ns]."""
-    return [(at, event) for at, event in log.messages("event") if isinstance(event, Event) and event.kind in kinds]
+    return [(at, event) for at, event in log.messages(Event) if event.kind in kinds]
 
 
 # ── processes that die, stand still and come back ──
@@ -104,7 +104,7 @@ def test_a_plant_that_stood_still_ends_the_old_session_before_anything_else(hil:
     log = hil.log
     ended = next(at for at, event in events(log, "released", "tripped") if event.session == old)
     ((lost, _), *_) = events(log, "lost")
-    truths = [(at, truth) for at, truth in log.messages("truth") if isinstance(truth, Truth) and at > lost]
+    truths = [(at, truth) for at, truth in log.messages(Truth) if at > lost]
     # One tick at the most: the one that it was waiting for when it was stopped.
     assert sum(any(truth.voltages) for at, truth in truths if at < ended) <= 1
 
@@ -131,7 +131,7 @@ def test_without_the_session_a_stranger_moves_nothing(hil: Hil) -> None:
     finally:
         stranger.terminate()
         stranger.wait(30)
-    truths = [truth for _, truth in hil.log.messages("truth") if isinstance(truth, Truth)]
+    truths = [truth for _, truth in hil.log.messages(Truth)]
     assert truths
     assert not any(any(truth.voltages) for truth in truths)
 
@@ -206,6 +206,6 @@ def test_the_cycles_that_a_law_in_python_drops_at_every_tick_are_collected_while
     hil.start(settings={**PATIENT, "law.kind": f"{HERE}:Cyclic"})
     hil.run(4.0)
     assert hil.state("controller") == "running"
-    alive = [sample.state["alive"][0] for _, sample in hil.log.messages("telemetry") if isinstance(sample, Telemetry)]
+    alive = [sample.state["alive"][0] for _, sample in hil.log.messages(Telemetry)]
     assert len(alive) > 20
     assert max(alive) < 7_000

@@ -51,7 +51,7 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     assert "law.C1[2]: should be less than or equal to 20" in refused(hil, "set-gains", "--C1", "1", "1", "100")
     hil.run(2.0)
     log, plant, controller = hil.log, hil.status("plant"), hil.status("controller")
-    published = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
+    published = [message for _, message in log.messages(Telemetry)]
     roll, pitch, yaw = (degrees(angle) for angle in to_euler(published[-1].desired))
     assert (roll, pitch, yaw) == pytest.approx((0.0, -10.0, 20.0), abs=1e-6)  # quintics and quaternions, rounded
     # The review computes the errors again from frames and changes; the controller published what it had computed.
@@ -86,7 +86,7 @@ def test_the_body_follows_a_file_and_a_live_stream_which_is_held_when_it_falls_s
     assert hil.happened("fault", "set-point refused")
     assert hil.state("plant") == "driven"
     log = hil.log
-    truths = [truth for _, truth in log.messages("truth") if isinstance(truth, Truth)]
+    truths = [truth for _, truth in log.messages(Truth)]
     assert degrees(to_euler(truths[-1].attitude)[2]) == pytest.approx(25.0, abs=4.0)
     assert len(log.changes) > 10  # every set-point that a tick took
 

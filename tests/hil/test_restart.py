@@ -103,7 +103,7 @@ def test_what_a_controller_that_was_killed_does_when_it_is_started_again(hil: Hi
         now = shown(hil)
         assert (now.reference, now.reference_from) == (after.reference, "operator")
     log = hil.log
-    truths = [truth for _, truth in log.messages("truth") if isinstance(truth, Truth)]
+    truths = [truth for _, truth in log.messages(Truth)]
     driven = [truth for truth in truths if truth.session == after.session]
     first, last = ([degrees(angle) for angle in to_euler(truth.attitude)] for truth in (driven[0], driven[-1]))
     match after_restart:

@@ -106,6 +106,6 @@ def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, kind:
         with pytest.raises(HilError, match=rf"is faulted: {re.escape(fault)}.*; `aeroloop op arm` lets it"):
             hil.set_gains(stiffness=[1.0, 1.0, 1.0])
     assert hil.processes.stop("controller") == (1 if kind == "Hanging" else 0)
-    truths = [truth for _, truth in hil.log.messages("truth") if isinstance(truth, Truth)]
+    truths = [truth for _, truth in hil.log.messages(Truth)]
     assert not any(truths[-1].voltages)
     assert any(any(truth.voltages) for truth in truths)

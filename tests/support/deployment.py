@@ -152,18 +152,14 @@ class Deployment(Hosts):
 
     def missed(self) -> tuple[dict[str, int], int]:
         """By the log: ticks of each end that are missing, and other messages that the recorder missed for good."""
-        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages("loss") if isinstance(loss, Loss))
+        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages(Loss))
         return dict(read(self.log_file).findings.missing_ticks), losses
 
     def _outcomes(self) -> Iterator[Outcome]:
         log = HilLog(self.log_file)
-        events = [(at * 1e-9, event) for at, event in log.messages("event") if isinstance(event, Event)]
+        events = [(at * 1e-9, event) for at, event in log.messages(Event)]
         trips = [at for at, event in events if event.kind == "tripped"]
-        states = sorted(
-            (at * 1e-9, status.state)
-            for at, status in log.messages("status")
-            if isinstance(status, Status) and status.role == "plant"
-        )
+        states = sorted((at * 1e-9, status.state) for at, status in log.messages(Status) if status.role == "plant")
         ends = [*(begun for _, begun, _ in self._troubles[1:]), self._finished]
         for (title, begun, ended), until in zip(self._troubles, ends, strict=True):
             tripped = [at for at in trips if begun < at < until]

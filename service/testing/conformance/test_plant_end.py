@@ -30,8 +30,7 @@ PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 
 
 def times(log: HilLog, kind: str, role: str) -> list[int]:
     """Times at which a role published an event of this kind [ns]."""
-    events = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]
-    return [at for at, event in events if event.kind == kind and event.role == role]
+    return [at for at, event in log.messages(Event) if event.kind == kind and event.role == role]
 
 
 def test_it_measures_at_its_rate_counting_from_0_and_the_loop_tracks(hil: Hil) -> None:
