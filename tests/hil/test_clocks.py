@@ -15,7 +15,7 @@ from aeroloop.service.config import load
 from aeroloop.service.testing.hil import HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, standalone
 from tests.hil.test_recorder import RATE, assert_whole
-from tests.support.processes import PATIENT
+from tests.support.processes import LONGEST_S, PATIENT
 
 RUN_S = 4.0
 STEP_S = 3600
@@ -56,10 +56,10 @@ def test_clocks_that_are_wrong_run_fast_and_step_in_mid_run_change_nothing(tmp_p
         "recorder": python_clocks(tmp_path, CLOCK_WRONG="86400", CLOCK_STEP=steps["recorder"]),
     }
     overrides = [*(f"{key}={value}" for key, value in PATIENT.items()), f"loop.rate_hz={RATE}"]
-    with ProcessGroup(standalone(load(overrides=overrides), tmp_path / "a.mcap")) as processes:
+    with ProcessGroup(standalone(load(overrides=overrides), tmp_path / "a.mcap", auto_arm=False)) as processes:
         for role in ("recorder", "plant", "controller"):
             processes.start(role, environment=environments[role])
-        processes.eventually("driving", lambda: processes.state("plant") == "driven")
+        processes.eventually("driving", lambda: processes.state("plant") == "driven", LONGEST_S)  # new interpreters
         for step in steps.values():
             time.sleep(RUN_S / 4)
             Path(step).touch()
@@ -67,6 +67,8 @@ def test_clocks_that_are_wrong_run_fast_and_step_in_mid_run_change_nothing(tmp_p
         assert processes.state("plant") == "driven"
         processes.signal("controller", signal.SIGSTOP)
         processes.eventually("the trip", lambda: processes.state("plant") == "tripped", 7.0)
+        processes.signal("controller", signal.SIGCONT)
+        processes.eventually("its notice", lambda: processes.state("controller") != "running")
         processes.stop("controller")
         processes.stop("plant")
     judged = assert_whole(tmp_path, round(0.5 * RUN_S * RATE))
