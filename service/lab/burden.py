@@ -104,8 +104,6 @@ def grid(
     Raises:
         GridError: An unknown name, or a cell that the configuration does not allow.
     """
-    if settings.plant.ideal:
-        raise GridError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
     pairs = [pair for pair in dict.fromkeys(map(bits_of_text, bits or BITS)) if pair != FLOAT64]
     kinds = chosen("--quantizer", quantizers, QUANTIZERS)
     levels = chosen("--sensors", sensors, SENSORS)

@@ -23,7 +23,6 @@ from typing import Any, Final, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
@@ -65,8 +64,8 @@ PLANTS: Final = ("aero", "rigid_body")
 WITHIN_DEG: Final = 10.0
 AS_CONFIGURED: Final = "its own"
 """Sensors and wind of a plant that is none of ours."""
-IDEAL: Final = "ideal"
-"""Those of an ideal plant of ours: perfect sensors, no wind."""
+DAMPING: Final = (0.0, 0.0071, 0.0220)
+"""θ of the paper, about the body's axes [N·m·s/rad], for a free body like the Aero."""
 
 
 class Choice(NamedTuple):
@@ -147,9 +146,6 @@ def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]
         choice = choice._replace(sensors=AS_CONFIGURED, wind=AS_CONFIGURED)
         with closing(load_over(settings, [f"plant.kind={choice.plant}"]).plant.make(settings.loop.period)) as made:
             wire["actuators"] = made.actuators
-    elif settings.plant.ideal:
-        choice = choice._replace(sensors=IDEAL, wind=IDEAL)
-        plant |= {"sensors": {}, "wind": {}}
     else:
         plant |= {"sensors": dict(SENSORS[choice.sensors].changes), "wind": {"blowing": WINDS[choice.wind]}}
     if choice.plant == "rigid_body":
@@ -161,7 +157,7 @@ def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]
             same = {
                 name: getattr(body, name) for name in ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
             }
-            plant["rigid_body"] = {**same, "damping": IDEAL_AERO.damping}
+            plant["rigid_body"] = {**same, "damping": DAMPING}
             plant["rotor"] = {"lag_up_s": 0.0, "lag_down_s": 0.0}
             plant["friction"] = {"viscous": [], "coulomb": []}
             plant["wind"]["torque"] = [0.0, *settings.plant.wind.torque[:2]]  # about y and z, as on the Aero

@@ -94,7 +94,6 @@ def test_parameters_of_one_quantizer_are_not_anothers() -> None:
         (("--quantizer", "round"), "round"),
         (("--sensors", "ear"), "ear"),
         (("--bits", "2/2"), "3 bits"),
-        (("--set", "plant.ideal=true"), "plant.ideal"),
         (("--figure", "a.txt"), "a.txt"),
         (("--figure", "no/such/folder/a.png"), "no/such/folder"),
     ],

@@ -33,12 +33,13 @@ from aeroloop.service.lab.tune import (
 )
 from aeroloop.service.terminal.show import show_all
 from tests.support.failing_laws import FAILING
+from tests.support.ideal import IDEAL
 from tests.support.in_this_process import run_here, workers_here
 from tests.support.own_laws import HERE
 
 SLOW = load(overrides=["loop.rate_hz=100"])
 AT_REST = [
-    "loop.rate_hz=100", "plant.kind=rigid_body", "plant.ideal=true", "wire.actuators=3", "reference.kind=hold",
+    "loop.rate_hz=100", "plant.kind=rigid_body", *IDEAL, "wire.actuators=3", "reference.kind=hold",
     "law.centre_of_mass=[0, 0, 0]", "plant.rigid_body.centre_of_mass=[0, 0, 0]", 'wire.voltage.bits="cont"',
 ]  # fmt: skip
 """A body that stays where it is without a voltage."""
