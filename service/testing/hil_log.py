@@ -14,7 +14,7 @@ from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
 from aeroloop.service.figures import Figures
-from aeroloop.service.review.review import report, review
+from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.process_group import HilError
 
 
@@ -108,7 +108,7 @@ class HilLog:
         try:
             from aeroloop.service.report.page import page
 
-            shown.write_text(page([report([self.path])]), encoding="utf-8")
+            shown.write_text(page([read(self.path).report()]), encoding="utf-8")
         except Exception as error:  # the same; and without the extra `review` there is no page
             yield f"no page: {type(error).__name__}: {error}".splitlines()[0]
         else:

@@ -15,7 +15,7 @@ from aeroloop.service.report import figure_style
 from aeroloop.service.report.figure_style import FORMATS
 from aeroloop.service.report.plots import draw_figures
 from aeroloop.service.review.report import Report
-from aeroloop.service.review.review import report
+from aeroloop.service.review.review import read
 from tests.support.made_log import make_log
 from tests.support.made_report import with_faults
 
@@ -32,7 +32,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def quantized(log: Path) -> Report:
-    return report([log])
+    return read(log).report()
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from aeroloop.service.logs.export import export
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.review import read, report, review
+from aeroloop.service.review.review import read, review
 from tests.support.edited_log import message_of, rewrite
 from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, write
 
@@ -162,7 +162,7 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     its: Mapping[str, Settings] = {"plant": plant, "recorder": recorder}
     roles = ("controller", "plant", "recorder")
     path = write(tmp_path / "a.mcap", controller, made(controller, 100), roles=roles, its=its)
-    shown = report([path])
+    shown = read(path).report()
     assert shown.settings["plant"] == plant.description()["plant"]
     assert shown.settings["recorder"]["decoded_hz"] == 50
     assert shown.settings["law"] == controller.description()["law"]
