@@ -86,19 +86,14 @@ def run_experiment(
     )
 
 
-def certify(
-    settings: Settings | None = None, *, disturbance: float | None = None, attitude_error_deg: float | None = None
-) -> Certificate:
+def certify(settings: Settings | None = None, *, disturbance: float | None = None) -> Certificate:
     """Evaluate the paper's Theorem 1 (Corollary 1 with a disturbance) for a configuration, as `aeroloop lab certify`.
 
     Args:
         settings: The configuration; the defaults if None.
         disturbance: Largest ‖τ_d‖ beyond what the plant's settings say [N·m]; a machine needs it.
-        attitude_error_deg: Assumed bound of the attitude error [deg]; `controller.start_within_deg` if None.
     """
-    return certificate.certify(
-        settings or load_settings(), disturbance=disturbance, attitude_error_deg=attitude_error_deg
-    )
+    return certificate.certify(settings or load_settings(), disturbance=disturbance)
 
 
 class RecordedRun(NamedTuple):

@@ -109,16 +109,6 @@ def certify(
         typer.Option(min=0, help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it."),
     ] = None,
     late: Annotated[float, typer.Option(min=0, help="Further delay of commands, in s.")] = 0.0,
-    attitude_error: Annotated[
-        float | None,
-        typer.Option(
-            metavar="DEG",
-            min=0,
-            max=180,
-            help="Assumed bound of the attitude error, in degrees; controller.start_within_deg if left out; 180 "
-            "assumes nothing.",
-        ),
-    ] = None,
     bits: BitsOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
     json: Json = False,
@@ -128,10 +118,10 @@ def certify(
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.theorem.certificate import certificate_of
+    from aeroloop.service.theorem import certificate
 
     with guarded():
-        result = certificate_of(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+        result = certificate.certify(settings, disturbance=disturbance, late_s=late)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

@@ -141,7 +141,7 @@ def _points(base: Settings, gains: Gains, plant: bool, late_s: float, kbit: floa
         split = base.model_copy(update={"wire": base.wire.with_bits(str(bits))})
         p = premises(split, desired, bounds, 0.0, late_s)
         at = reach(p)
-        outside = [] if at is None else [name for *_, name in beyond(split, desired, p, at)]
+        outside = [] if at is None else [name for *_, name in beyond(split, p, at)]
         if at is None or (plant and (outside or bounds.unproven)):
             found.append(None)
             continue

@@ -44,7 +44,7 @@ from aeroloop.service.lab.sweep import (
     sweep_rows,
     write_table,
 )
-from aeroloop.service.theorem.certificate import certificate_of
+from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
 
@@ -292,9 +292,9 @@ def run_comparison(
 
 
 def _proven(settings: Settings) -> Row:
-    """What is proven of a configuration; of a user's law that certifies itself only whether it holds."""
+    """What is proven of a configuration."""
     try:
-        certificate = certificate_of(settings, margins=False)
+        certificate = certify(settings, margins=False)
     except (NoTheoremError, BoundlessError):
         return dict.fromkeys(_PROVEN)
     return {name: getattr(certificate, name, None) for name in _PROVEN}

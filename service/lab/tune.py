@@ -26,7 +26,7 @@ from aeroloop.service.figures import Floats
 from aeroloop.service.lab.experiment import LoopEndedError, experiment
 from aeroloop.service.lab.laws import PUSHED_S, survived
 from aeroloop.service.lab.sweep import Column, Progress, Row, Sheets, Workers, run_of, with_seed
-from aeroloop.service.theorem.certificate import certificate_of
+from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
 
@@ -394,7 +394,7 @@ def _as_gain(value: Any) -> Gain | None:
 def _verdict(settings: Settings) -> str:
     """The verdict of the configuration's certificate, or why its law has none."""
     try:
-        return certificate_of(settings).verdict
+        return certify(settings).verdict
     except (NoTheoremError, BoundlessError) as error:
         return str(error)
 

@@ -65,7 +65,7 @@ def check_theorem(
     omega_d = lemma.times(lemma.rotation(at.attitude), at.desired_rate)
     x = lemma.Samples(of_nearer_sign(q, at.attitude), omega, at.attitude, at.rate, at.desired, omega_d, sign)
     b = lemma.coordinates(x.q, omega, x.q_d, omega_d, sign, gain)
-    theta = None if e is None else e.bounds.theta
+    theta = None if e is None else e.plant.plant.theta
     theta_error = np.zeros((1, 3)) if theta is None else theta - estimate
     true = np.vstack([b.norm, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
 
