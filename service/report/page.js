@@ -110,4 +110,7 @@ for (const plot of plots) draw(plot); // all at once, so that a page saved or pr
 addEventListener("beforeprint", () => {
   for (const plot of plots) draw(plot, { width: 465, height: 60 + 100 * plot.dataset.panels, autosize: false });
 });
-addEventListener("afterprint", redraw);
+addEventListener("afterprint", () => {
+  plots.forEach(Plotly.purge); // which forgets the size on paper
+  redraw();
+});
