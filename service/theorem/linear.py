@@ -72,12 +72,11 @@ class Gain(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """Gains of every output, and ‖·‖ of w_s for ε̃, (ε̃, z₂) and f at which it is balanced."""
+    """Gains of every output, and ‖·‖ of w_s for ε̃ and (ε̃, z₂) at which it is balanced."""
 
     gains: dict[str, Gain]
     eps: float
     z: float
-    feedback: float
 
 
 def system(axis: Axis) -> System:
@@ -150,10 +149,8 @@ def responses(axes: tuple[Axis, ...]) -> Responses | None:
         else:
             plain = _gain([row @ flow for row, flow in zip(rows, flows, strict=True)], systems, s)
             gains[name] = Gain(plain.start, (*plain.forced, rates.forced[4], 0.0))
-    eps, z, feedback = (
-        max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z", "feedback")
-    )
-    return Responses(gains, eps, z, feedback)
+    eps, z = (max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z"))
+    return Responses(gains, eps, z)
 
 
 def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Gain:

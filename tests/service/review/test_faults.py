@@ -12,7 +12,7 @@ import pytest
 from aeroloop.protocol.messages.models import FaultStatus, Status
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.report.page import page, verdict
+from aeroloop.service.report.page import verdict
 from aeroloop.service.review.report import FaultInterval
 from aeroloop.service.review.review import read
 from tests.support.edited_log import edited, message_of, rewrite
@@ -52,16 +52,12 @@ def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(fau
     ]  # fmt: skip
 
 
-def test_the_verdict_and_the_page_name_the_faults(faulty: Path) -> None:
-    review = read(faulty)
-    (word, good, because), made = verdict(review.findings), review.report()
+def test_the_verdict_names_the_faults(faulty: Path) -> None:
+    findings = read(faulty).findings
+    word, good, because = verdict(findings)
     assert (word, good) == ("Faults", None)
-    counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
+    counts = f"{findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
     assert f"3 faults acted at the plant: {counts}." in because
-    html = page([made])
-    row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
-    for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):
-        assert cell in row
 
 
 def test_review_lists_them_before_the_figures(faulty: Path, capsys: pytest.CaptureFixture[str]) -> None:

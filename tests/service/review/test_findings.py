@@ -154,20 +154,6 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
 # The whole
 
 
-def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
-    facts = {"git": "abc", "cpu": "two cores"}
-    path = rewrite(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
-    made = read(path).report([Limit.parse("skipped_ticks=0"), Limit.parse("latency_us.p99=100")])
-    assert made.name == "night"
-    assert made.settings["wire"]["voltage"]["bits"] == 6
-    host = {"host": "h", "versions": {}}
-    assert made.facts == {"controller": host, "plant": host, "recorder": facts}
-    assert made.findings.checks == [
-        Check(text="skipped_ticks ≤ 0", holds=True, found="0"),
-        Check(text="latency_us.p99 ≤ 100 µs", holds=False, found="300 µs"),
-    ]
-
-
 def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert execute(["log", "review", str(whole), "--json", "--require", "z_track=50e-4"]) == 0
     assert [check["holds"] for check in json.loads(capsys.readouterr().out)["checks"]] == [True]

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import load
@@ -89,27 +88,6 @@ def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: 
 
 
 # Saturation, and what is no value
-
-
-def test_values_at_the_outermost_level_are_counted_by_signal(whole: Path, tmp_path: Path) -> None:
-    """Of the last hundred ticks, a motor at its limit in one command, both in another, and a rate in ten frames."""
-    wire = load().wire
-
-    def commands(columns: Any) -> None:
-        for k in (420, 421):
-            frame = np.void(wire.command.pack(k % 256, (-31, 31 if k == 421 else 30)))
-            columns["command"][columns["tick"] == k] = frame
-
-    def measurements(columns: Any) -> None:
-        for k in range(430, 440):
-            frame = np.void(wire.measurement.pack(k % 256, (126, 0, 0, 0, 0, -127)))
-            columns["measurement"][columns["session_tick"] == k] = frame
-
-    path = rewrite(whole, tmp_path / "a.mcap", edited("controller", commands))
-    clean, findings = found(whole), found(rewrite(path, tmp_path / "b.mcap", edited("plant", measurements)))
-    more = {name: findings.saturated[name] - clean.saturated[name] for name in findings.saturated}
-    assert more == pytest.approx({"attitude": 0.0, "rate": 10 / (3 * TICKS), "voltage": 3 / (2 * TICKS)}, abs=1e-12)
-    assert findings.invalid == {"measurement": 0, "command": 0}
 
 
 def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Path) -> None:
