@@ -106,10 +106,11 @@ def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
     if (found := run.theorem) is None:
         return []
     sentences: list[tuple[bool | None, str]] = [(bool(found.holds), found.verdict)]
-    judged = {"broken": "Lemma 1", "pointwise_share": "the bound at every instant"}
-    by = " and ".join(what for name, what in judged.items() if getattr(found, name) is not None)
+    judged = [("Lemma 1", found.broken, 0), ("the bound at every instant", found.pointwise_share, 1)]
+    kept = " and ".join(what for what, worst, _ in judged if worst is not None)
+    broke = " and ".join(what for what, worst, most in judged if worst is not None and worst > most)
     if found.held is not None:
-        sentences.append((found.held, f"The run kept to {by}." if found.held else f"The run broke {by}."))
+        sentences.append((found.held, f"The run kept to {kept}." if found.held else f"The run broke {broke}."))
     elif found.holds is not None:
         sentences.append((None, f"Nothing of it could be judged: {run.reasons.get('theorem.held', 'no true states')}."))
     if found.held is None:
