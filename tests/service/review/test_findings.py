@@ -151,6 +151,13 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
     ]
 
 
+def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
+    storm = [event(i * 1e-3, "plant", "refused", f"no {i}", session=None) for i in range(900)]
+    marks = [mark for mark in found(rewrite(whole, tmp_path / "a.mcap", more=storm)).marks if mark.kind == "refused"]
+    assert len(marks) == 301
+    assert marks[-1].text == "600 more, the last: no 899"
+
+
 # The whole
 
 
