@@ -81,9 +81,9 @@ def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: 
     }  # fmt: skip
     for label, row in rows.items():
         unit = next(panel.unit for _, panel in found if panel.label == label)
-        values = np.concatenate([line.values for _, panel in found if panel.label == label for line in panel.lines])
+        drawn = np.concatenate([line.values for _, panel in found if panel.label == label for line in panel.lines])
         text = _plain(label) + ("" if unit == "1" else f"<br>[{_plain(unit)}]")
-        is_wide = unit == "ms" and np.nanmin(values) > 0 and np.nanmax(values) > WIDE * np.nanmin(values)
+        is_wide = unit == "ms" and np.nanmin(drawn) > 0 and np.nanmax(drawn) > WIDE * np.nanmin(drawn)
         layout[axes[row].replace("y", "yaxis")] = {
             "title": {"text": text, "standoff": 4, "font": {"color": INK}}, "gridcolor": GRID, "fixedrange": True,
             "zerolinecolor": "#d9dde3", "nticks": 5, "exponentformat": "power",

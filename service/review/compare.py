@@ -42,10 +42,12 @@ def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Prog
 
     Logs of one name are named with their folders, and if that is not enough, by number.
     """
-    runs = list[Report]()
-    for i, log in enumerate(logs):
-        share = progress and (lambda part, i=i: progress((i + part) / len(logs)))
-        runs.append(read(log, progress=share).report(limits, MAX_POINTS // len(logs)))  # one page holds them all
+
+    def share(done: int) -> Progress | None:
+        return None if progress is None else lambda part: progress((done + part) / len(logs))
+
+    points = MAX_POINTS // len(logs)  # one page holds them all
+    runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
     alike, names = [run.name for run in runs], list[str]()
     for name, log in zip(alike, logs, strict=True):
         long = name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"

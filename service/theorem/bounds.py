@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, pi, sin, sqrt
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,7 +238,7 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
         return alpha_dot
 
     S_error = skew(x.omega) @ b.R - skew(x.omega_Q) @ Q.R
-    sides = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
+    sides: dict[str, tuple[str, Floats, Any]] = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
         "C.28": ("‖ε^Q − ε‖", (x.q_Q - q)[:, 1:], p.delta_eps),
         "C.29": ("‖ω^Q − ω‖", x.omega_Q - x.omega, p.delta_omega),
         "C.26": ("‖ω_e‖", b.omega_e, d.k_omega_e * z),
