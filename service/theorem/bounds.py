@@ -59,7 +59,7 @@ class Known:
     k_omega_d: Annotated[float, Term("k_ω_d", "Assumption 1", "rad/s", "largest ‖ω_d‖ of the reference")]
     k_omega_d_dot: Annotated[float, Term("k_ω̇_d", "Assumption 1", "rad/s²", "largest ‖ω̇_d‖ of the reference")]
     half_angle_d: Annotated[float, Term("max ∡q_d/2", "C.16", "rad", "largest angle of the reference, halved")]
-    half_angle_e: Annotated[float, Term("max ∡e/2", "Assumption 3", "rad", "half of controller.start_within_deg")]
+    half_angle_e: Annotated[float, Term("max ∡e/2", "Assumption 3", "rad", "assumed: 20° or that of the set, halved")]
     k_theta: Annotated[float, Term("max ‖θ‖", "Assumption 2", "N·m·s/rad", "assumed: by law.damping_bound")]
     k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "θ by Assumption 2, θ̂ by the projection")]
     k_tau_d: Annotated[float, Term("k_τ_d", "C.78", "N·m", "largest ‖τ_d‖; 0 is Theorem 1")]

@@ -23,6 +23,7 @@ from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.motion import START_WITHIN_DEG
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.extremes import BoundlessError, Extremes, chords, extremes, motors
 from aeroloop.service.theorem.feedback import NoTheoremError, feedback_of
@@ -112,7 +113,9 @@ class Evaluated:
     plant_reach: Reach | None
 
 
-def evaluate(settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0) -> Evaluated:
+def evaluate(
+    settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0, start_deg: float = START_WITHIN_DEG
+) -> Evaluated:
     """The quantities of a certificate; arguments and errors as of `certify`.
 
     The assumed attitude error is widened to that of the sets, so that no certificate contradicts itself.
@@ -130,7 +133,7 @@ def evaluate(settings: Settings, *, disturbance: float | None = None, late_s: fl
     body_reach, plant_reach = reach(body), reach(plant)
     paper = None
     if isinstance(settings.law, AdaptiveSettings):
-        start = radians(min(180.0, settings.controller.start_within_deg))
+        start = radians(min(180.0, start_deg))
         error = max(start, *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at), 0.0)
         known = _known(settings, settings.law, body, error)
         lemma = lemma_1(known)
@@ -188,7 +191,12 @@ def _error(signal: SignalSpec, elements: int) -> float:
 
 
 def certify(
-    settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0, margins: bool = True
+    settings: Settings,
+    *,
+    disturbance: float | None = None,
+    late_s: float = 0.0,
+    start_deg: float = START_WITHIN_DEG,
+    margins: bool = True,
 ) -> Certificate:
     """The certificate of a configuration.
 
@@ -196,6 +204,7 @@ def certify(
         settings: The configuration.
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         late_s: Further age of a command, by delay, or by lost frames where the law has no integral [s].
+        start_deg: Assumed bound of the attitude error, for Lemma 1 [deg].
         margins: Search delay_ms and lost_frames, too.
 
     Raises:
@@ -203,7 +212,7 @@ def certify(
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    e = evaluate(settings, disturbance=disturbance, late_s=late_s)
+    e = evaluate(settings, disturbance=disturbance, late_s=late_s, start_deg=start_deg)
     violated = _violated(settings, e, e.plant, e.plant_reach)
     delay = _largest_delay(settings, e) if margins and not violated else None
     law, at = e.plant.law, e.plant_reach
@@ -357,7 +366,7 @@ def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) ->
     yield f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)"
     if e.paper:
         error = degrees(2 * e.paper.known.half_angle_e)
-        yield f"for Lemma 1: the attitude error stays below {error:g}° (controller.start_within_deg)"
+        yield f"for Lemma 1: the attitude error stays below {error:g}°"
     yield "a state near enough to the set, once, and for the age of a command before"
     if any(law.ki):
         yield "the integral in balance then, and no measurement lost: without one it does not advance"

@@ -38,7 +38,7 @@ def theorem_of(e: Evaluated) -> Theorem:
 
 def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> None:
     """8 and 6 bits, an attitude error of at most 90° assumed; plain arithmetic from (C.58) to (C.72), (C.80)."""
-    found = certify(load_over(PAPER, ["controller.start_within_deg=90"]), disturbance=0.01)
+    found = certify(PAPER, start_deg=90, disturbance=0.01)
 
     d_eps = d_omega = sqrt(3) / 255  # l = 2/(2⁸ − 1), half of it on each of three axes
     d_u = sqrt(2) * 24 / 63  # two motors
@@ -192,7 +192,7 @@ def test_a_reference_that_rolls_is_not_certified_where_the_roll_is_held() -> Non
 
 
 def test_the_assumed_error_is_never_smaller_than_that_of_the_set() -> None:
-    found = certify(certified_settings(8, 8, "controller.start_within_deg=0.1"))
+    found = certify(certified_settings(8, 8), start_deg=0.1)
     assert found.plant_deg is not None
     assert degrees(2 * (found.value("max ∡e/2") or 0.0)) == pytest.approx(found.plant_deg)
 
@@ -209,7 +209,7 @@ def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     law = AdaptiveSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
     most = radians(100)
     settings = Settings(wire=PAPER.wire.with_bits("cont"), law=law, reference=Hold(attitude=(0.0, 0.0, 0.0)))
-    c0 = theorem_of(evaluate(load_over(settings, ["controller.start_within_deg=100"]))).c0
+    c0 = theorem_of(evaluate(settings, start_deg=100)).c0
     rng = np.random.default_rng(0)
     half, axis = most / 2 * rng.random(20_000), rng.standard_normal((20_000, 3)) * [0.1, 1, 0.1]
     eps = axis / np.linalg.norm(axis, axis=1, keepdims=True) * np.sin(half)[:, None]

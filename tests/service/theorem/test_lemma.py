@@ -17,7 +17,7 @@ from aeroloop.protocol.wire.attitude import IDENTITY, Vector, received_quaternio
 from aeroloop.protocol.wire.quantizer import Quantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
-from aeroloop.service.config import Settings, load_over
+from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Floats, Trajectory, reference_function
 from aeroloop.service.theorem.bounds import Samples, coordinates, lemma_inequalities, rotation, times
@@ -49,7 +49,7 @@ LEMMA = tuple(DELTAS)
 
 def bounds(wire: WireSpec, disturbance: float = 0.0) -> Paper:
     settings = Settings(wire=wire, law=LAW, reference=REFERENCE)
-    found = evaluate(load_over(settings, ["controller.start_within_deg=15"]), disturbance=disturbance).paper
+    found = evaluate(settings, disturbance=disturbance, start_deg=15).paper
     assert found is not None
     return found
 
