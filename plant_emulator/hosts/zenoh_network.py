@@ -71,7 +71,7 @@ class ZenohNetwork(PlantNetwork):
         self._endpoint = endpoint
         self._link: ZenohLink | None = None
         self._changed = changed
-        self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
+        self._trace = PlantTrace(endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
         self._counters = endpoint.wire.measurement.counters
         self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
@@ -322,13 +322,10 @@ class PlantTrace:
     called with every batch; `run` is the random number that identifies this process, drawn if None.
     """
 
-    def __init__(
-        self, loop: LoopSettings, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None
-    ) -> None:
+    def __init__(self, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None) -> None:
         self._publish = publish
         self._command_bytes = wire.command.size
-        run = secrets.randbits(64) if run is None else run
-        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
+        self._writer = TraceWriter("plant", wire, secrets.randbits(64) if run is None else run)
 
     def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Add the row of the last tick, and publish a batch that is due. Nothing without a session.

@@ -21,8 +21,6 @@ STATUS_VALUES: Final = 2048
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
 ]
-
-
 Source = Literal["configured", "operator", "resumed", "held"]
 """Where gains or a reference come from: the configuration, an operator, the session before, or the attitude found."""
 
@@ -37,15 +35,10 @@ def _no_other_topics_key(session: str) -> str:
 
 SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"), AfterValidator(_no_other_topics_key)]
 """One chunk of a key, and not the first chunk of a topic's key."""
-
-
 TokenName = Annotated[str, StringConstraints(pattern=r"^[^/*$#?]{1,64}$")]
 """One chunk of a liveliness token's key, without wildcards."""
-
-
 MAX_SIGNALS: Final = 16
 """So many fit into the 2 KiB of a true state."""
-
 Signals = Annotated[
     dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")], FiniteFloat | None],
     Field(max_length=MAX_SIGNALS),
@@ -89,10 +82,7 @@ class SessionRecord(Message):
 
     @property
     def in_force(self) -> list[Change]:
-        """The changes that set gains and reference; none without a session, and of a stream, whose set-points it lacks.
-
-        They are those of `operator.in_force` for the trace's changes.
-        """
+        """The changes in force, as `operator.in_force` gives; none without a session, or of a stream."""
         if self.session is None or isinstance(self.reference, Stream):
             return []
         gains = Change(session=self.session, tick=self.gains_since_tick, gains=self.gains)

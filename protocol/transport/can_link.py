@@ -19,6 +19,7 @@ from aeroloop.protocol.transport.can_format import (
     HEARTBEAT_S,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
+    SILENT_S,
     CanError,
     CanSettings,
     Heartbeat,
@@ -104,8 +105,8 @@ class CanLink(Link):
 
     @property
     def silent(self) -> bool:
-        """Whether the other end has been silent for longer than `can.silent_s`."""
-        return self.silent_s() > self._settings.silent_s
+        """Whether the other end has been silent for longer than `SILENT_S`."""
+        return self.silent_s() > SILENT_S
 
     def reopen(self) -> bool:
         """Reopen the bus after a fault; whether that succeeded."""

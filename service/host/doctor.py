@@ -20,9 +20,8 @@ from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
-from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
+from aeroloop.protocol.transport.certificate import PLAIN_S, SOON_DAYS, CertificateError, read_certificate, refusal
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
-from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.wire.spec import LoopSettings
 
 CHECK_S: Final = 5.0

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from aeroloop.service.testing.hil import Hil
+from aeroloop.service.testing.process_group import free_rendezvous
 from tests.hil.test_faults import PATIENT
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually
@@ -23,17 +24,17 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
     for role in ("recorder", "operator"):
         ours.issue(role)
         foreign.issue(role)
-    keys = {"network.security.directory": str(ours.folder), "network.loopback_secured": True}
+    secured = free_rendezvous("tls")
+    keys = {"network.security.directory": str(ours.folder), "network.rendezvous": secured}
     hil.start(settings={**PATIENT, **keys})
     hil.run(3.0)  # beyond the first look at the places, which must not disturb the loop
 
     def op(*words: str) -> subprocess.CompletedProcess[str]:
-        rendezvous = f"network.rendezvous={json.dumps(hil.settings.network.rendezvous)}"
-        command = [sys.executable, "-P", "-m", "aeroloop", "op", *words, "--set", rendezvous]
+        command = [sys.executable, "-P", "-m", "aeroloop", "op", *words]
         return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
     def keyed(folder: Path) -> list[str]:
-        return ["--set", f"network.security.directory={folder}", "--set", "network.loopback_secured=true"]
+        return ["--set", f"network.security.directory={folder}", "--set", f"network.rendezvous={secured}"]
 
     states = {"controller": "running", "plant": "driven", "recorder": "recording"}
 
@@ -43,7 +44,10 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
         return {role: status["state"] for role, status in found.items()} == states
 
     eventually("the status of all", well)  # on a busy machine a link may take longer than a command waits, 0.5 s
-    strangers = {"foreign": keyed(foreign.folder), "none": []}
+    strangers = {
+        "foreign": keyed(foreign.folder),
+        "none": ["--set", f"network.rendezvous={secured.replace('tls', 'tcp')}"],
+    }
     for words in strangers.values():
         refused = op("stop", *words)
         assert refused.returncode == 1

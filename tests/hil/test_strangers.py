@@ -15,6 +15,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Release
 from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Request
 from aeroloop.service.testing.hil import Hil
+from aeroloop.service.testing.process_group import free_rendezvous
 from tests.hil.test_faults import PATIENT
 from tests.support.certificates import Authority
 from tests.support.certified_link import open_session
@@ -58,7 +59,8 @@ def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: 
     ours = Authority(tmp_path)
     for role in ("plant", "controller", "recorder", "operator"):
         ours.issue(role, "aero")
-    hil.start(settings={**PATIENT, "network.security.directory": str(ours.folder), "network.loopback_secured": True})
+    secured = {"network.security.directory": str(ours.folder), "network.rendezvous": free_rendezvous("tls")}
+    hil.start(settings={**PATIENT, **secured})
     hil.run(1.5)  # until each has published a status
     running = hil.status("controller").session
     assert running is not None

@@ -50,9 +50,8 @@ class Ends:
         self._rows = rows
         self._changes = changes or {}
         self._random = random.Random(7)
-        every_ns = settings.loop.period_ns * rows
-        self._plant = TraceWriter("plant", settings.wire, 11, every_ns)
-        self._controller = TraceWriter("controller", settings.wire, 12, every_ns)
+        self._plant = TraceWriter("plant", settings.wire, 11)
+        self._controller = TraceWriter("controller", settings.wire, 12)
         self._plant.session = self._controller.session = SESSION
 
     def tick(self, k: int, now_ns: int, wall_ns: int) -> Iterator[Published]:

@@ -102,7 +102,7 @@ class Stage(PlantNetwork):
         self.wires = Wires()
         self.sent: list[bytes] = []
         self._published: deque[bytes] = deque()
-        self.trace = PlantTrace(loop, wire, self._published.append, run=RUN)
+        self.trace = PlantTrace(wire, self._published.append, run=RUN)
         self._between, self._answer, self._skip = between, answer, skip
         self._claims = 0
         self._ends = 0

@@ -120,7 +120,7 @@ class Mischief:
 
 def traced(seed: int) -> tuple[LoopSettings, WireSpec, PlantSettings, list[Batch]]:
     random = Random(seed)
-    loop = LoopSettings(lockstep=random.random() < 0.3, realtime="off", trace_s=0.01)
+    loop = LoopSettings(lockstep=random.random() < 0.3, realtime="off")
     wire = random.choice(WIRES)
     faults = random.sample(FAULTS, random.choice((0, 0, 1, 3)))
     limits = PLANT.limits.model_copy(update={"max_rate": random.choice((0.02, 20.0, 20.0))})
@@ -142,7 +142,7 @@ def replayed(loop: LoopSettings, wire: WireSpec, plant: PlantSettings, batches: 
 
 def undisturbed() -> tuple[LoopSettings, WireSpec, list[Batch]]:
     """A session from the first tick on, every measurement of which is answered at once."""
-    loop, wire = LoopSettings(realtime="off", trace_s=10), WireSpec()
+    loop, wire = LoopSettings(realtime="off"), WireSpec()
 
     def claim(stage: Stage) -> None:
         if stage.endpoint.session is None and stage.endpoint.ticked < 10:

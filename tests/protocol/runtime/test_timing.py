@@ -184,11 +184,3 @@ def test_loop_timing_measures_from_when_a_tick_was_due_and_leaves_the_start_out(
         (11, 30.0), (10, 100.0), (9, PERIOD / 1000)
     ]  # fmt: skip
     assert found.recent_period == found.period
-
-
-def test_the_warm_up_begins_with_the_first_tick_however_long_the_loop_waited_for_it() -> None:
-    clock = FakeClock(START)
-    timing = LoopTiming(10 * PERIOD, clock)
-    clock.now_ns = START + 1000 * PERIOD
-    timing.woke(START)
-    assert timing.wake.total.count == 0

@@ -16,7 +16,6 @@ from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, sent_vector
-from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
@@ -24,7 +23,7 @@ from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
 
-COUNTERS = 1 << DEFAULT_COUNTER_BITS
+COUNTERS = 1 << 8
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000

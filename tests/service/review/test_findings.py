@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Loss
-from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read_header
+from aeroloop.protocol.messages.trace import Outcome, Received, read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.review.report import Check, Findings, Spread
@@ -112,8 +112,9 @@ def test_in_lockstep_an_event_is_shown_at_the_tick_that_ran_when_it_was_publishe
 
     def slower(one: Said) -> Said:
         one = edited("plant", longer)(one)
-        if one.topic != "trace" or not one.key.endswith("plant") or (header := read_header(one.data)) is None:
+        if one.topic != "trace" or not one.key.endswith("plant") or (batch := read_batch(one.data)) is None:
             return one
+        header = batch.header
         later = 9 * (header.wall_ns - START_NS)
         clocks = struct.pack("<qq", header.monotonic_ns + later, header.wall_ns + later)
         return one._replace(data=one.data[:32] + clocks + one.data[48:])
