@@ -37,7 +37,7 @@ from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
-from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
+from aeroloop.protocol.runtime.timing import RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -188,9 +188,9 @@ class ZenohNetwork(PlantNetwork):
                 refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
                 stale=endpoint.stale,
                 saturated=endpoint.saturated,
-                latency_us=summary(self._latency.total),
-                recent_latency_us=summary(self._latency.recent()),
-                timing=report(self.timing) if self.timing else None,
+                latency_us=self._latency.total.summary(),
+                recent_latency_us=self._latency.recent().summary(),
+                timing=self.timing.report() if self.timing else None,
                 notes=self.notes,
                 lacks_recorder="gone" if self._recorder.gone else None,
                 faults=self._faults(),

@@ -126,10 +126,6 @@ class Description(Message):
     versions: dict[str, str]
     facts: dict[str, str] = Field(default_factory=dict, description="the host, and its properties that affect timing")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
-    freshness_s: float | None = Field(
-        default=None,
-        description="2^counter_bits periods: a frame that is later than this may be taken for a newer one [s]",
-    )
     certificate: dict[str, Any] | None = Field(
         default=None,
         description="controller: certificate of its configuration, as `aeroloop lab certify --json` prints it",
