@@ -180,7 +180,7 @@ class Bridge:
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
             self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
-            if bus.mend():
+            if bus.reopen():
                 self._role.event("changed", "the bus is open again")
         elif relay.session is None or bus.peer is None:
             pass

@@ -87,19 +87,12 @@ def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
 
 
 class Heartbeat(NamedTuple):
-    """State of one end, sent ten times a second and on a change.
+    """State of one end, sent ten times a second and on a change."""
 
-    Attributes:
-        state: Plant: its state. Controller: the state that it requests.
-        number: Plant: 0, or which of `TripCause` tripped it, from 1. Controller: number of the session, 0…15.
-        fingerprint: Of its wire, period and lockstep.
-        at_ns: When it was received, on `time.monotonic_ns()`; 0 in one that is sent.
-    """
-
-    state: PlantState
-    number: int
-    fingerprint: bytes
-    at_ns: int = 0
+    state: PlantState  # the plant's own; of the controller, the one that it requests
+    number: int  # plant: 0, or which of `TripCause` tripped it, from 1; controller: number of the session, 0…15
+    fingerprint: bytes  # of its wire, period and lockstep
+    at_ns: int = 0  # when it was received, on `time.monotonic_ns()`; 0 in one that is sent
 
     @property
     def cause(self) -> TripCause | None:

@@ -46,13 +46,8 @@ ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time withou
 def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
     """Open a session that meets the others at the rendezvous. The caller closes it.
 
-    `identity` is what the process is. `listen` is whether others can connect to it: yes for a role, no for a command
-    that only queries.
-
-    Raises:
-        NetworkError: A `listen` endpoint cannot be opened, a client's settings name no router, or links cannot be
-            secured as configured.
-        CertificateError: A certificate is needed, and this process has none that is good.
+    `listen` is whether others can connect to it: yes for a role, no for a command that only queries. Raises
+    NetworkError if an endpoint cannot be opened as configured, CertificateError for want of a good certificate.
     """
     network = protected(settings, identity)
     if listen:
@@ -129,9 +124,7 @@ def command_session(
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
-
-    Raises:
-        NetworkError: It is a client's, and no router answers; else as `join`.
+    Errors are those of `join`, and NetworkError if it is a client's and no router answers.
     """
     wait_ms = round(wait_s * 1000)
     network = protected(settings, identity)
@@ -174,7 +167,7 @@ class FrameSession:
 
     @property
     def wanted(self) -> bool:
-        """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
+        """Whether frames are to travel by datagrams."""
         return self._network.settings.mixed
 
     @property

@@ -156,7 +156,7 @@ def test_a_bus_that_fails_for_a_moment_is_opened_again_and_the_session_goes_on(
     opened = flaws.opened
     bus.stranger.say(0x40, bytes(8), is_error_frame=True)  # bus-off, at both ends
     bus.until("the fault", lambda: "bus-off" in caplog.text)
-    assert bus.side.reopen()
+    bus.until("the reopening", bus.side.reopen)
     assert flaws.opened == opened + 2
     bus.stranger.everything()
     bus.side.peer = None
@@ -183,7 +183,7 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     assert 2 <= flaws.opened - opened <= 2 + (time.monotonic() - lost_at) / 0.5
     assert sum("trying again" in record.getMessage() for record in caplog.records) == 1
     flaws.lost = flaws.gone = False
-    assert bus.side.reopen()
+    bus.until("the reopening", bus.side.reopen)
     bus.send_heartbeat(PlantState.IDLE)
     bus.await_heartbeat(PlantState.TRIPPED, 7)  # mended, it says what happened
     bus.begin(number=2)
