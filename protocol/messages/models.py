@@ -127,8 +127,7 @@ class Description(Message):
     facts: dict[str, str] = Field(default_factory=dict, description="the host, and its properties that affect timing")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
     certificate: dict[str, Any] | None = Field(
-        default=None,
-        description="controller: certificate of its configuration, as `aeroloop lab certify --json` prints it",
+        default=None, description="controller: of its configuration, as `aeroloop lab certify --json` prints it"
     )
 
 
@@ -172,9 +171,7 @@ class Status(Message):
     state: str
     session: str | None = None
     cause: str | None = Field(
-        default=None,
-        description="plant: why it is not armed; controller: why it claims no vehicle; recorder: why nothing is "
-        "written; null otherwise",
+        default=None, description="why a plant is not armed, a controller claims no vehicle, a recorder writes nothing"
     )
     process: str = Field(default="", description="host and process id of the role")
     since: AwareDatetime | None = Field(default=None, description="plant: when the cause arose, UTC")
@@ -199,22 +196,18 @@ class Status(Message):
     lost: int = Field(default=0, description="recorder: messages missing in its log since start")
     lacks_recorder: Literal["gone", "required"] | None = Field(
         default=None,
-        description="plant, controller: gone: a recorder was there, and disappeared without a last status `stopped`; "
-        "controller: required: none is there, and it claims no vehicle without one",
+        description="gone: it disappeared without a last status `stopped`; required: the controller waits for one",
     )
     latency_us: Percentiles | None = Field(
-        default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
+        default=None, description="plant: from a measurement sent to its answer, plant's clock"
     )
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     age_us: Percentiles | None = Field(
-        default=None,
-        description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
+        default=None, description="controller: from a measurement received to its answer sent, last 10 s [µs]"
     )
     timing: Timing | None = Field(default=None, description="timing of the loop; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="settings that the host refused")
-    faults: list[FaultStatus] = Field(
-        default_factory=list, description="emulated plant: faults that act, have acted, or are to come"
-    )
+    faults: list[FaultStatus] = Field(default_factory=list, description="emulated plant: past, acting and to come")
     gains: Gains | None = Field(default=None, description="controller: its gains, of the next session if none runs")
     gains_from: Source | None = None
     reference: str | None = Field(default=None, description="controller: its reference, in words; likewise")

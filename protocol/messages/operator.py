@@ -211,8 +211,7 @@ class Track(Message):
         default=None,
         ge=0.02,
         le=MAX_WITHIN_S,
-        description="time to reach it from the present one, null: the shortest; coming to rest takes as long as "
-        "braking does [s]",
+        description="time to reach it, or to come to rest; null: the shortest [s]",
     )
 
 
@@ -228,12 +227,10 @@ class Change(Message):
     reference: Reference | None = Field(default=None, description="null: as before")
     within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: a jump [s]")
     start: Angles | None = Field(
-        default=None,
-        description="where the approach to the reference starts, at rest; null: at the reference before [deg]",
+        default=None, description="where the approach to it starts, at rest; null: at the reference before [deg]"
     )
     brake_s: Angles | None = Field(
-        default=None,
-        description="time of it in which roll, pitch, yaw each brake to rest first; null: a single quintic [s]",
+        default=None, description="time in which roll, pitch, yaw each brake to rest first; null: a single quintic [s]"
     )
     run_up_s: Angles | None = Field(
         default=None, description="time of it in which each runs up to the reference's rate at last [s]"

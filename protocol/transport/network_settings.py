@@ -70,8 +70,7 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         "one of 8 ports of its own host's and connects to all; tls/… is mutual TLS on loopback, too; [] for none",
     )
     listen: list[EndpointText] = Field(
-        default=[],
-        description="further Zenoh endpoints this process can be reached at; port 0 is any free one",
+        default=[], description="further endpoints this process can be reached at; port 0 is any free one"
     )
     connect: list[EndpointText] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
     transport: Literal["mixed", "tcp"] = Field(
@@ -81,8 +80,7 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     )
     security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
     insecure: bool = Field(
-        default=False,
-        description="allow plain text beyond loopback: anyone on that network can then drive the vehicle",
+        default=False, description="allow plain text beyond loopback: anyone there can then drive the vehicle"
     )
 
     @field_validator("rendezvous", mode="before")

@@ -84,12 +84,9 @@ class SignalSpec(BaseModel, frozen=True, extra="forbid"):
     )
     kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
     hysteresis: Positive | None = Field(
-        default=None,
-        description="hysteresis-uniform: h, by which a held interval is widened [signal's unit]; half a step",
+        default=None, description="hysteresis-uniform: h, widens a held interval [signal's unit]; half a step"
     )
-    threshold: Positive | None = Field(
-        default=None, description="logarithmic-uniform: where steps stop growing [signal's unit]; limit/4"
-    )
+    threshold: Positive | None = Field(default=None, description="logarithmic-uniform: y_t [signal's unit]; limit/4")
 
     @model_validator(mode="after")
     def _makes_a_quantizer(self) -> SignalSpec:
@@ -126,15 +123,10 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
     attitude: SignalSpec = Field(
         default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
     )
-    rate: SignalSpec = Field(
-        default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
-    )
+    rate: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ω, body frame [rad/s]")
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
     actuators: int = Field(
-        default=2,
-        ge=1,
-        le=MAX_ACTUATORS,
-        description="number of motors: 2 for the Aero's u₂ and u₃, n for u₁…uₙ of any other plant",
+        default=2, ge=1, le=MAX_ACTUATORS, description="number of motors: 2 for the Aero's u₂ and u₃, n for u₁…uₙ"
     )
     transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
     counter_bits: int = Field(
