@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import Sender, Transmit
 
-PERIOD_NS = 2_000_000
 COUNTERS = 16
 HEARTBEATS = st.integers(1, COUNTERS // 2 - 1)
 CODES = st.tuples(st.integers(-1, 1), st.integers(0, 1))  # few, so that most ticks repeat the last
