@@ -58,6 +58,11 @@ class Certificate:
         return self.file.with_suffix(".key")
 
     @property
+    def name(self) -> str:
+        """Host or person that it was issued to."""
+        return subject_field(self.x509, "OU")
+
+    @property
     def not_after(self) -> datetime:
         """End of its validity, UTC."""
         return self.x509.not_valid_after_utc

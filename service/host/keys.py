@@ -140,7 +140,7 @@ def _shown(file: Path) -> KeyFile:
             file=file.name,
             role=found.role,
             vehicle=found.vehicle,
-            name=subject_field(found.x509, "OU"),
+            name=found.name,
             valid_until=found.not_after,
             days_left=found.days_left,
             fingerprint=found.x509.fingerprint(SHA256()).hex(),

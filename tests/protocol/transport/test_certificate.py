@@ -44,7 +44,7 @@ def test_a_processs_own_certificate_is_found_by_role_and_vehicle(tmp_path: Path)
     assert own_certificate(authority.folder, ("operator",), None).file == of_all
     of_all.unlink()
     found = own_certificate(authority.folder, ("recorder", "operator"), None)
-    assert (found.file, found.role, found.vehicle) == (own, "operator", "aero")
+    assert (found.file, found.role, found.vehicle, found.name) == (own, "operator", "aero", "a test")
     assert 0.9 < found.days_left < 1.1
 
 
