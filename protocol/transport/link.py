@@ -124,6 +124,7 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         """Stop receiving."""
-        for declared in (self._subscribers, self._publishers):
-            while declared:
-                declared.pop().undeclare()
+        while self._subscribers:
+            self._subscribers.pop().undeclare()
+        while self._publishers:
+            self._publishers.pop().undeclare()
