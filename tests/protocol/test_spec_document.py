@@ -76,11 +76,15 @@ def number(text: str) -> int:
 
 def form(frame: str, counter_bits: str, bits: str, actuators: str) -> FrameFormat:
     """The format that the first cells of a row describe."""
-    widths = [None if cell.strip() == "cont" else int(cell) for cell in bits.split(",")]
+    widths = [as_bits(cell.strip()) for cell in bits.split(",")]
     if frame == "measurement":
         return wire_of(widths[0], widths[1], 6, counter_bits=int(counter_bits)).measurement
     assert frame == "command", f"{frame!r} is neither a measurement nor a command"
     return wire_of(8, 8, widths[0], int(actuators), int(counter_bits)).command
+
+
+def as_bits(text: str) -> int | None:
+    return None if text == "cont" else int(text)
 
 
 def test_the_golden_vectors_are_there() -> None:
