@@ -186,6 +186,11 @@ class Header(NamedTuple):
     wall_ns: int  # the same instant on the end's wall clock, since 1970
     session: str  # empty where the plant has none
 
+    @property
+    def row_dtype(self) -> np.dtype[np.void]:
+        """Fields of the rows."""
+        return row_dtype(self.end, self.measurement_bytes, self.command_bytes, self.actuators)
+
 
 class Batch(NamedTuple):
     """A decoded batch. Columns by name have shape (rows,); voltages (rows, actuators)."""
@@ -212,7 +217,7 @@ def read_batch(payload: bytes) -> Batch | None:
     if not name.isascii() or not measurement or not command or rows > MAX_ROWS:
         return None
     header = Header._make((ENDS[end], bool(flags & _FINAL), *figures, name.rstrip(b"\0").decode()))
-    kinds = row_dtype(header.end, measurement, command, actuators)
+    kinds = header.row_dtype
     if len(payload) != HEADER_BYTES + rows * kinds.itemsize + tail_bytes:
         return None
     try:
