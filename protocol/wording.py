@@ -12,12 +12,9 @@ from pydantic import BaseModel, BeforeValidator, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-SHOWN: Final = 60
-"""Characters of a refused value or an unknown key that are shown."""
+SHOWN: Final = 60  # characters of a refused value or an unknown key
+_SAID: Final = 600  # characters of pydantic's words, which may quote what was given
 _PLAIN: Final = {"missing": "is missing", "model_type": "should be a section", "tuple_type": "should be a list"}
-"""Words for what pydantic names by a type of Python, by the error's type."""
-_SAID: Final = 600
-"""Characters of pydantic's words that are shown: they may quote what was given."""
 
 
 def keys(model: type[BaseModel], section: str = "") -> dict[str, FieldInfo]:
@@ -61,7 +58,9 @@ def problems(error: ValidationError, *models: type[BaseModel]) -> Iterator[str]:
         said = " or ".join(dict.fromkeys(_said(each) for each in (first, *others)))
         given = first["input"]
         of_whole = first["type"] in ("missing", "json_invalid") or isinstance(given, dict | BaseModel)
-        yield f"{key}: {said}".removeprefix(": ") + ("" if of_whole else f", not {_line(_json(given), SHOWN)}")
+        yield f"{key}: {said}".removeprefix(": ") + (
+            "" if of_whole else f", not {_line(json.dumps(given, ensure_ascii=False, default=repr), SHOWN)}"
+        )
 
 
 def problem(error: ValidationError, *models: type[BaseModel]) -> str:
@@ -92,13 +91,6 @@ def _unknown(key: str, known: Collection[str]) -> str:
 def _said(error: ErrorDetails) -> str:
     said = _PLAIN.get(error["type"]) or error["msg"].removeprefix("Value error, ").removeprefix("Input ")
     return _line(said, _SAID)
-
-
-def _json(value: object) -> str:
-    try:
-        return json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):
-        return repr(value)
 
 
 def _line(text: str, length: int) -> str:

@@ -19,10 +19,9 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
-from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
-from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
+from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid
+from aeroloop.protocol.transport.certificate import PLAIN_S, SOON_DAYS, CertificateError, read_certificate, refusal
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
-from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.wire.spec import LoopSettings
 
 CHECK_S: Final = 5.0
@@ -82,7 +81,7 @@ def diagnose(
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
         timing.done()
-    wake = summary(timing.wake.total)
+    wake = timing.wake.total.summary()
     limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
     late = wake is None or wake.p999 > limit_us
     trial = Finding(

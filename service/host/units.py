@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.runtime.realtime import PRIORITY
 from aeroloop.service.config import Settings
 
 CONFIG: Final = Path("/etc/aeroloop/aeroloop.toml")
@@ -103,9 +104,8 @@ def unit(name: str, source: Source) -> str:
     elif name == "router":
         rights.append("CapabilityBoundingSet=")
     else:
-        priority = source.settings.loop.priority
         rights += [
-            f"LimitRTPRIO={priority}",
+            f"LimitRTPRIO={PRIORITY}",
             "LimitMEMLOCK=infinity",
             "CapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK",
         ]

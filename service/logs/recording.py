@@ -371,7 +371,7 @@ def read_description(text: str | bytes, address: Address | None) -> Description:
         raise ValueError("a description is no JSON object")
     if (version := content.get("protocol", PROTOCOL_VERSION)) != PROTOCOL_VERSION:
         raise ValueError(f"it is of protocol version {version}; read it with the aeroloop that wrote it")
-    description = Description.model_validate(content)
+    description = Description.model_validate(content, extra="ignore")
     if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
         raise ValueError(f"a description of {address.vehicle}'s {address.role} is of another role")
     try:

@@ -75,7 +75,7 @@ def test_with_certificates_it_says_which_is_refused_where(tmp_path: Path) -> Non
     for authority in (ours, foreign):
         authority.issue("operator")
         authority.issue("plant", "aero")
-    settings = NetworkSettings(rendezvous=[free_rendezvous()], ports=1, loopback_secured=True)
+    settings = NetworkSettings(rendezvous=[free_rendezvous("tls")])
 
     def of(authority: Authority) -> NetworkSettings:
         security = SecuritySettings(directory=str(authority.folder), vehicles=["aero"])

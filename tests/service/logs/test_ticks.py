@@ -166,7 +166,7 @@ def test_the_sign_of_q_goes_on_where_only_the_plant_has_a_tick(tmp_path: Path) -
     """A body that turns by a degree a tick, whose measurements have η ≥ 0: past half a turn q is the negative one."""
     settings, messages, clocks = load(), Messages(), (Clock("plant"), Clock("controller"))
     wire, end = settings.wire, ControllerEnd(settings, messages, clocks[1])
-    plant = TraceWriter("plant", wire, RUNS["plant"], 10**12)
+    plant = TraceWriter("plant", wire, RUNS["plant"])
     plant.session = SESSION
     for k in range(400):
         for clock in clocks:

@@ -212,9 +212,9 @@ def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
 def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
     """It ends as soon as its cable is back and a new message has come: 2.5 MB were published meanwhile."""
     port, count = free_port(), 1700
-    published = Publisher(gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1)))
+    published = Publisher(gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"])))
     with Cable(port) as cable:
-        running = record(NetworkSettings(rendezvous=[], listen=[], gossip=False, connect=[cable.endpoint]))
+        running = record(NetworkSettings(rendezvous=[], listen=[], connect=[cable.endpoint]))
         published.send(1)
         running.await_written()
         cable.cut()

@@ -148,9 +148,7 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller = load()
-    plant = load(
-        overrides=["plant.aero.mass=2.0", 'plant.faults=["rate:off@5"]', "law.C2=[9, 9, 9]", "loop.priority=7"]
-    )
+    plant = load(overrides=["plant.aero.mass=2.0", 'plant.faults=["rate:off@5"]', "law.C2=[9, 9, 9]", "loop.cpus=[0]"])
     recorder = load(overrides=["recorder.decoded_hz=50"])
     its: Mapping[str, Settings] = {"plant": plant, "recorder": recorder}
     roles = ("controller", "plant", "recorder")
