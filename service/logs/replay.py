@@ -25,8 +25,9 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Missing, SessionKey, Source, Unknown
+from aeroloop.service.logs.session import Missing, SessionKey, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
+from aeroloop.service.logs.trace_index import Source
 
 
 class TickDifference(BaseModel, frozen=True):

@@ -13,7 +13,18 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import NEVER, Batch, End, Outcome, Received, row_dtype
+from aeroloop.protocol.messages.trace import (
+    NEVER,
+    Batch,
+    End,
+    Header,
+    Outcome,
+    Received,
+    Tail,
+    read_batch,
+    read_columns,
+    row_dtype,
+)
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings
 
@@ -25,21 +36,7 @@ Table = npt.NDArray[np.void]
 SessionKey = tuple[str, str]
 """A vehicle and a session."""
 
-Range = tuple[int, int]
-"""First and last tick."""
-
 NO_TICK: Final = -1
-
-ANSWER_S: Final = 1.2
-"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
-
-
-class Source(NamedTuple):
-    """A process of an end."""
-
-    vehicle: str
-    end: End
-    run: int
 
 
 class Missing(BaseModel, frozen=True):
@@ -129,52 +126,36 @@ class Session:
     acted: Places
 
 
-class TableBuilder:
-    """Fills the table of one end's rows, batch by batch in order; at most `rows` of them.
+def table_of(
+    end: End, wire: WireSpec, batches: Sequence[tuple[Header, bytes]]
+) -> tuple[Table, dict[int, dict[str, Any]], int]:
+    """One end's rows, from batches in order.
 
-    `states` has the controller's state before its first row and each first row after a gap. A batch of another wire is
-    left out and counted in `malformed`.
+    Returns:
+        The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
-
-    def __init__(self, end: End, wire: WireSpec, rows: int) -> None:
-        self.states: dict[int, dict[str, Any]] = {}
-        self.malformed = 0
-        self._wire = wire.measurement.size, wire.command.size, wire.actuators
-        self._filled, self._next_row = 0, -1
-        self._table = np.zeros(rows, table_dtype(end, wire))
-
-    def add(self, batch: Batch) -> None:
-        """Add the next batch."""
-        header = batch.header
-        if (header.measurement_bytes, header.command_bytes, header.actuators) != self._wire:
-            self.malformed += 1
-            return
-        begin, self._filled = self._filled, self._filled + header.rows
-        if header.first_row != self._next_row and batch.tail.state is not None:
-            self.states[begin] = batch.tail.state
-        self._next_row = header.first_row + header.rows
-        rows = self._table[begin : self._filled]
+    sizes = wire.measurement.size, wire.command.size, wire.actuators
+    fitting = [one for one in batches if (one[0].measurement_bytes, one[0].command_bytes, one[0].actuators) == sizes]
+    kinds = row_dtype(end, *sizes)
+    wide = {"tick", "session_tick", "answered", "received", "sent"}
+    columns = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or ()]
+    table = np.zeros(sum(header.rows for header, _ in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
+    states = dict[int, dict[str, Any]]()
+    filled, next_row = 0, -1
+    for header, payload in fitting:
+        batch = Batch(header, read_columns(header, payload), Tail())
+        if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
+            states[filled] = whole.tail.state
+        next_row = header.first_row + header.rows
+        rows = table[filled : filled + header.rows]
         for name, column in batch.columns.items():
             rows[name] = column
         rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
         rows["wall"] = header.wall_ns - header.monotonic_ns
-        if "answered" in batch.columns:
-            rows["answered"][rows["answered"] == NEVER] = NO_TICK
-
-    def table(self, unknown: Sequence[Unknown] = ()) -> Table:
-        """All rows, without those of the plant at unknown ticks."""
-        table = self._table[: self._filled]
-        for one in unknown if "session_tick" in (table.dtype.names or ()) else ():
-            table = table[(table["session_tick"] < one.first_tick) | (table["session_tick"] > one.last_tick)]
-        return table
-
-
-def table_dtype(end: End, wire: WireSpec) -> np.dtype[np.void]:
-    """Columns of a trace's rows, with 64 bits for ticks and times, and `wall`."""
-    rows = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
-    wide = {"tick", "session_tick", "answered", "received", "sent"}
-    names = rows.names or ()
-    return np.dtype([*((name, np.dtype(np.int64) if name in wide else rows[name]) for name in names), ("wall", "<i8")])
+        filled += header.rows
+    if end == "plant":
+        table["answered"][table["answered"] == NEVER] = NO_TICK
+    return table, states, len(batches) - len(fitting)
 
 
 def join(

@@ -10,17 +10,23 @@ from __future__ import annotations
 import errno
 import json
 import re
+import struct
 import time
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
+from mcap.exceptions import McapError
+from mcap.records import Metadata
+from mcap.stream_reader import StreamReader
+
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import RECORDER_METADATA, opening
+from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
@@ -240,9 +246,9 @@ class RollingLog:
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file's metadata name this run or, if runs are named by the time, any run so named."""
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            head = opening(path)
-            if head is not None and head.name == RECORDER_METADATA:
+        with suppress(OSError, McapError, struct.error, ValueError, KeyError, TypeError), path.open("rb") as file:
+            _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
+            if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
                 return run["part"] == path.stem and re.fullmatch(self._runs, run["run"]) is not None
         return False
