@@ -59,9 +59,8 @@ class Ticks(NamedTuple):
         voltages: What was commanded; NaN where nothing was, or no valid value [V].
         unquantized: u before quantization [V].
         gains: The law's gains, one beside the other.
-        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad].
-        state_next: The same after the tick; of the paper's law the sign of the equilibrium approached. Where the
-            controller computed nothing, of the law's own state at the last tick that it did.
+        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad] and the sign of the equilibrium.
+        state_next: The same after the tick. Where the controller computed nothing, that of the last tick that it did.
     """
 
     k: Integers
@@ -176,8 +175,7 @@ def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = Non
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     """Compute a session again: what the controller computed, and at the other ticks the errors that the plant measured.
 
-    Raises:
-        LawError, PluginError: As of `Controller`.
+    Raises LawError or PluginError as `Controller` does.
     """
     wire, controller, plant = session.settings.wire, session.controller, session.plant
     at, at_plant = session.at_controller, session.at_plant
@@ -190,31 +188,12 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     table, widths, missed = _computed(session, progress)
     valid = ~np.isnan(table[:until, widths[0]])  # where q was measured
     judged: slice | Integers = slice(until) if valid.all() else np.flatnonzero(valid)  # a slice copies nothing
-    wall, sent, latency, there, back, offset_ns = _timed(session)
+    *times, offset_ns = _timed(session)
     volts = _voltages(session)
-    state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = np.split(
-        table[judged], np.cumsum(widths)[:-1], axis=1
-    )
-    k = session.k[judged]
+    state, q, state_next, *law, u = np.split(table[judged], np.cumsum(widths)[:-1], axis=1)
+    k, gains = session.k[judged], _gains(session, session.k[judged])
     return Recomputed(
-        ticks=Ticks(
-            k=k,
-            wall_ns=wall[judged],
-            sent_ns=sent[judged],
-            latency_ns=latency[judged],
-            measurement_delay_ns=there[judged],
-            command_delay_ns=back[judged],
-            attitude=attitude,
-            desired=desired,
-            rate=rate,
-            attitude_error=attitude_error,
-            rate_error=rate_error,
-            voltages=volts[judged],
-            unquantized=unquantized,
-            gains=_gains(session, k),
-            state=state,
-            state_next=after,
-        ),
+        ticks=Ticks(k, *(time[judged] for time in times), q, *law, volts[judged], u, gains, state, state_next),
         answered=session.k[answered],
         voltages=volts[answered],
         missed=session.k[missed[missed < until]],

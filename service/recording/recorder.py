@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 WORK_EVERY_S: Final = 0.5  # messages can wait: a chunk is closed only once a second
 STATUS_EVERY_S: Final = 1.0
+DECODED_HZ: Final = 10.0  # of each decoded channel beside the raw messages; `log export --format mcap` has all
 AT_ONCE: Final = 2000  # messages written before anything else is done: the service manager expects a status
 END_S: Final = 8.0  # longest time for what caches hold when recording ends; a service manager kills after 10
 
@@ -52,13 +53,12 @@ class Recorder:
         self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
         self._status_at, self._status_written = time.monotonic(), 0
         self._decoder: Decoder | None = None
-        if settings.decoded_hz:
-            try:
-                from aeroloop.service.viewers.channels import Decoder
+        try:
+            from aeroloop.service.viewers.channels import Decoder
 
-                self._decoder = Decoder(settings.decoded_hz)
-            except ModuleNotFoundError:
-                role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
+            self._decoder = Decoder(DECODED_HZ)
+        except ModuleNotFoundError:
+            role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
         self._subscribers = [RecoveringSubscriber(role.zenoh, topics.key(name, "*")) for name in topics.RECORDED]
 
     def run(self) -> None:

@@ -31,6 +31,10 @@ from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
 
+CHUNK_S: Final = 1.0
+"""A chunk is written this often: the most that a crash or a power cut costs [s]."""
+MAX_FILE_S: Final = 3600.0
+"""A new file begins after this time: what a viewer opens at once [s]."""
 RETRY_S: Final = 1.0
 REMIND_S: Final = 60.0
 """How often a fault that lasts is reported again [s]."""
@@ -77,9 +81,8 @@ class RollingLog:
         self.trouble = ""
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
-        place = settings.path or settings.directory
-        self._base = log_path(place, _BY_TIME)
-        self._runs = re.escape(self._base.stem) if self._base == place else r"aeroloop-\d{8}-\d{6}"  # that are ours
+        self._base = log_path(settings.path, _BY_TIME)
+        self._runs = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"  # that are ours
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
@@ -116,7 +119,7 @@ class RollingLog:
         """Do what is due: write the chunk, retry the disk, begin a new file. If `at_once`, retry before it is due."""
         now = self._clock()
         if now >= self._due or (at_once and self.trouble):
-            self._due = now + self.settings.chunk_s
+            self._due = now + CHUNK_S
             self._write()
 
     def close(self, waiting: int = 0) -> None:
@@ -163,7 +166,7 @@ class RollingLog:
             self._report(f"recording again to {self.path}", False)
         elif gone:
             self._report(f"{last} was moved or removed while it was written", True)
-        if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= self.settings.max_file_s:
+        if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= MAX_FILE_S:
             try:
                 self._next_file()
             except OSError as error:
