@@ -24,7 +24,7 @@ from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import Target, merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import LawSection, law_settings
+from aeroloop.service.control.laws.registry import CustomLawSettings, LawSection, law_settings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 
@@ -142,7 +142,7 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
     tree = Settings().description()
     for given in sources(file, overrides, Settings):
         merge(tree, given)
-    return from_description(tree)
+    return _valid(tree)
 
 
 def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
@@ -159,13 +159,20 @@ def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
 
 
 def from_description(config: dict[str, Any]) -> Settings:
-    """The configuration in a role's description.
+    """The configuration in a role's description. Keys that this version does not have are left out.
 
     Raises:
         ConfigError: This version cannot read it.
     """
+    settings = _valid(config, extra="ignore")
+    if isinstance(settings.law, CustomLawSettings):  # keys of a user's law, which are not ours to know
+        return settings.model_copy(update={"law": CustomLawSettings.model_validate(config["law"])})
+    return settings
+
+
+def _valid(tree: dict[str, Any], extra: Literal["forbid", "ignore"] | None = None) -> Settings:
     try:
-        return Settings.model_validate(config)
+        return Settings.model_validate(tree, extra=extra)
     except ValidationError as error:
         raise ConfigError("; ".join(problems(error, Settings))) from None
 
@@ -174,7 +181,7 @@ def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
     tree = settings.description()
     merge(tree, tree_of(overrides))
-    return from_description(tree)
+    return _valid(tree)
 
 
 def with_bits(settings: Settings, text: str | None) -> Settings:

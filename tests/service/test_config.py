@@ -156,6 +156,16 @@ def test_a_description_is_read_without_the_readers_environment(monkeypatch: pyte
     assert from_description(old).loop.rate_hz == 500
 
 
+def test_a_description_is_read_without_keys_that_this_version_does_not_have_and_with_those_of_a_user() -> None:
+    settings = load(overrides=["law.kind=my:Law", "law.k=3", "can.options={a = 1}", "plant.kind=my:P", "plant.own.b=2"])
+    old = settings.description()
+    for section in (old, old["loop"], old["network"]["security"], old["reference"], old["wire"]["rate"]):
+        section["gone"] = 1
+    assert from_description(old) == settings
+    old["law"] = {"kind": "pd", "gone": 1}
+    assert from_description(old).law == load(overrides=["law.kind=pd"]).law
+
+
 OVERRIDES: tuple[tuple[str, ...], ...] = (
     (),
     ("reference.kind=hold", "wire.rate.bits=cont", "recorder.path=a b.mcap", "controller.duration_s=3"),
