@@ -125,7 +125,7 @@ class Recorder:
             for received in subscriber.take():
                 address = topics.read_key(received.key)
                 if address is not None and address.topic.name == "description":
-                    self._configure(received)  # at once: other messages are decoded by it
+                    self._describe(received)
                 size = len(received.payload) + OVERHEAD
                 if not self.log.trouble or self._waiting_bytes + size <= WAITING_BYTES:
                     self.waiting.append((received, now_ns))
@@ -145,18 +145,17 @@ class Recorder:
                 decoded = self._decoder.take(address, received.payload, received.published_ns)
             self.log.add(received, at_ns, decoded)
 
-    def _configure(self, received: Delivery) -> None:
+    def _describe(self, received: Delivery) -> None:
+        """Put a role's newest description into the log's metadata."""
         if received.published_ns < self._described.get(received.key, 0):
             return  # recovered after a newer one
         try:
-            description = Description.decode(received.payload)
+            Description.decode(received.payload)
         except MessageError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
         self._described[received.key] = received.published_ns
         self.log.add_description(received.key, received.payload)
-        if self._decoder is not None:
-            self._decoder.configure(description)
 
     # ── reports ──
 

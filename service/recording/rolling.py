@@ -82,7 +82,9 @@ class RollingLog:
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
         self._base = log_path(settings.path, _BY_TIME)
-        self._runs = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"  # that are ours
+        self._runs = (
+            re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
+        )  # that are ours
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
