@@ -91,9 +91,12 @@ def test_a_recorded_log(reader: Reader, whole: Path) -> None:
     assert ours(whole)["aeroloop/aero/telemetry"]["count"] == TICKS // 10
 
 
-def test_the_files_of_a_rotated_run(reader: Reader, whole: Path, tmp_path: Path) -> None:
+def test_the_files_of_a_rotated_run(
+    reader: Reader, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each of them alone, and together as many messages as were recorded."""
-    settings = RecorderSettings(path=tmp_path / "run.mcap", chunk_s=1e-9, max_file_mb=0.005)
+    monkeypatch.setattr(rolling, "CHUNK_S", 1e-9)
+    settings = RecorderSettings(path=tmp_path / "run.mcap", max_file_mb=0.005)
     log = rolling.RollingLog(settings, lambda text, _: pytest.fail(text))
     with whole.open("rb") as file:
         for i, (_, channel, message) in enumerate(make_reader(file).iter_messages()):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from math import inf
 from pathlib import Path
 
 import pytest
 
-from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
@@ -57,24 +55,6 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
     steps = abs(float(volts[0]) - float(volts[1])) / (48 / 63)  # (2·y_max)/(2^R − 1)
     assert signal == f"u3: {volts[0]} V logged, {volts[1]} V computed, {steps:.0f} steps apart"
     assert "details" not in both.model_dump()
-
-
-def test_a_part_is_replayed_by_its_times_and_names_what_is_missing_in_it_alone(tmp_path: Path) -> None:
-    """The plant's state is known at its first row only."""
-    messages = made(lockstep(), TICKS, spoil=321)
-    gone = [m for m in messages if m.key.endswith("trace/controller")][1]
-    log = write(tmp_path / "a.mcap", lockstep(), [m for m in messages if m != gone])
-    for times, differ, lacks in (((0.5, 0.75), 1, 0), ((0.8, inf), 0, 0), ((0.0, 0.4), 0, 1)):
-        both = replay([log], since_s=times[0], until_s=times[1])
-        (session,) = both.sessions
-        assert session.first_tick == times[0] / 0.002
-        assert (session.differ, len(both.missing), both.complete) == (differ, lacks, not lacks)
-        assert both.plant is None
-        assert "not in part" in both.reasons["plant"]
-    assert replay([log], since_s=0.5, until_s=0.75).controller == EndReplay(ticks=126, differ=1)
-    assert execute(["log", "replay", str(log), "--from", "0.8"]) == 0
-    assert execute(["log", "replay", str(log), "--to", "0.4"]) == 1
-    assert execute(["log", "replay", str(log), "--from", "2", "--to", "1"]) == 2
 
 
 def test_with_another_law_it_reports_what_would_have_been_commanded(tmp_path: Path) -> None:

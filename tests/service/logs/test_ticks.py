@@ -20,8 +20,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.daemon.tick_source import PlantTick
-from aeroloop.service.logs import recording as recording_module
-from aeroloop.service.logs.recording import Recording, ReviewError
+from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
 from aeroloop.service.logs.ticks import Ticks, codes_in, levels, recompute
 from aeroloop.service.review.review import review
@@ -200,18 +199,6 @@ def test_a_part_of_a_session_has_the_ticks_of_the_whole(tmp_path: Path) -> None:
         if "delay" not in name:  # the clocks' offset is fitted by what is read
             assert bits(getattr(part, name)) == bits(getattr(whole, name)[500:1001]), name
     assert len(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION), 1.0, 2.0).controller) < 800
-
-
-def test_a_log_that_takes_more_memory_than_there_is_is_refused_with_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make_log(tmp_path / "a.mcap", 600)
-    session = Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION))
-    monkeypatch.setattr(recording_module, "available_bytes", lambda: 300_000)
-    with pytest.raises(
-        ReviewError, match=r"600 ticks take .* GiB of memory, .* `aeroloop log review` and `aeroloop log export` read"
-    ):
-        recompute(session)
 
 
 def test_ticks_and_z_track_are_found_by_the_specification_alone() -> None:
