@@ -57,7 +57,8 @@ class RecorderSettings(BaseModel, extra="forbid"):
     """Settings of the recorder."""
 
     path: Path = Field(
-        default=Path("logs"), description="folder of the logs (a name without an ending is one), or the log's first file"
+        default=Path("logs"),
+        description="folder of the logs (a name without an ending is one), or the log's first file",
     )
     max_file_mb: float = Field(default=256.0, gt=0, description="begin a new file after this size [MB]")
     keep_gb: float | None = Field(

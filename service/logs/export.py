@@ -31,10 +31,6 @@ from aeroloop.service.logs.table import Column, TrueStates, columns_of
 from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
-ALL: Final = "all"
-
-ENDINGS: Final[dict[Format, str]] = {"parquet": ".parquet", "csv": ".csv", "mat": ".mat", "mcap": "-decoded.mcap"}
-"""Ending of a new file's name."""
 
 AT_A_TIME: Final = 1 << 16
 """Rows that are turned into columns at a time."""
@@ -91,8 +87,10 @@ def export(
         OutputError: The file must not be written, or cannot.
         ReviewError: The log cannot be read.
     """
-    out = out or with_ending(paths[0], ENDINGS[to])
-    sessions: list[str] | None = None
+    log = paths[0].resolve() if paths[0].is_dir() else paths[0]  # "." has no name
+    stem = log.name if log.is_dir() else log.stem
+    out = out or log.with_name(stem + ("-decoded.mcap" if to == "mcap" else f".{to}"))
+    chosen: list[SessionKey] = []
     try:
         with writing(out, paths, force=force) as part:
             recording = Recording(paths, progress)
@@ -104,9 +102,8 @@ def export(
                     )
                 rows, columns, damages = write_decoded(recording, part, progress)
             else:
-                first = recording.choose(None if session == ALL else session, vehicle)
-                chosen = recording.sessions_of(first[0]) if session == ALL else [first]
-                sessions = ["/".join(which) for which in chosen]
+                first = recording.choose(None if session == "all" else session, vehicle)
+                chosen = recording.sessions_of(first[0]) if session == "all" else [first]
                 rows, columns, damages = _write_table(recording, to, part, chosen, (since_s, until_s))
             size = part.stat().st_size
     except ConfigError as error:
@@ -114,22 +111,14 @@ def export(
     return Exported(
         out=str(out),
         format=to,
-        sessions=sessions,
+        sessions=None if to == "mcap" else ["/".join(which) for which in chosen],
         rows=rows,
         columns=columns,
         bytes=size,
         damages=damages,
-        unknown=[one for one in recording.unknown if f"{one.vehicle}/{one.session}" in (sessions or ())],
-        left_out=[name for name in map("/".join, recording.extents) if sessions and name not in sessions],
+        unknown=[one for one in recording.unknown if (one.vehicle, one.session) in chosen],
+        left_out=["/".join(which) for which in recording.extents if chosen and which not in chosen],
     )
-
-
-def with_ending(log: Path, ending: str) -> Path:
-    """A log's name, or its folder's, with another ending."""
-    if log.is_dir():
-        log = log.resolve()  # "." has no name
-        return log.with_name(log.name + ending)
-    return log.with_name(log.stem + ending)
 
 
 def _write_table(
@@ -143,7 +132,13 @@ def _write_table(
         "recorded_by": {role: found.versions for role, found in recording.described(chosen[0]).items()},
         "exported_by": versions(),
     }
-    states, malformed = _true_states(recording, chosen)
+    states, malformed = TrueStates({which[1]: recording.settings(which).wire.actuators for which in chosen}), 0
+    truth = "truth", chosen[0][0]
+    for _, message in recording.messages(lambda address: (address.topic.name, address.vehicle) == truth or None):
+        try:
+            states.add(message.data)
+        except ValueError:
+            malformed += 1
     pieces = _pieces(recording, chosen, times_s, states)
     if (first := next(pieces, None)) is None:
         raise ExportError(f"{recording.name} has no answered measurement to export")
@@ -161,10 +156,7 @@ def _write_table(
 
 
 def _pieces(
-    recording: Recording,
-    chosen: Sequence[SessionKey],
-    times_s: tuple[float, float],
-    states: TrueStates,
+    recording: Recording, chosen: Sequence[SessionKey], times_s: tuple[float, float], states: TrueStates
 ) -> Iterator[list[Column]]:
     """The columns of some sessions of one vehicle, some rows at a time; a signal of any of them is a column of all."""
     signals = {which: states.signals(which[1]) for which in chosen}
@@ -180,23 +172,6 @@ def _pieces(
             some = ticks.where(slice(begin, begin + AT_A_TIME))
             at = np.searchsorted(truth[1:, 0], some.k, side="right")  # 0: before the first
             yield columns_of(which, some, truth[at], session.settings, names)
-
-
-def _true_states(recording: Recording, chosen: Sequence[SessionKey]) -> tuple[TrueStates, int]:
-    """True states of some sessions of one vehicle, and how many messages are malformed."""
-    states = TrueStates({which[1]: recording.settings(which).wire.actuators for which in chosen})
-    vehicle, malformed = chosen[0][0], 0
-    for _, message in recording.messages(
-        lambda address: True if (address.topic.name, address.vehicle) == ("truth", vehicle) else None
-    ):
-        try:
-            states.add(message.data)
-        except ValueError:
-            malformed += 1
-    return states, malformed
-
-
-# ── Files ──
 
 
 def _values(column: Column) -> Any:
@@ -246,7 +221,7 @@ def _write_mat(path: Path, schema: Any, batches: Iterator[Any]) -> int:
         struct[field.name] = column.cast(pa.int64() if field.name == "published_ns" else pa.float64()).to_numpy()
     if (size := sum(values.nbytes for values in struct.values())) > MAT_LIMIT:
         raise ExportError(
-            f"a MATLAB file holds 2 GiB, and these rows take {size / 2**30:.1f} GiB; use --to parquet, "
+            f"a MATLAB file holds 2 GiB, and these rows take {size / 2**30:.1f} GiB; use --format parquet, "
             "which MATLAB reads by parquetread"
         )
     for name in ("unit", "description"):
