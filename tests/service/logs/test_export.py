@@ -15,14 +15,14 @@ import pyarrow.parquet
 import pytest
 import scipy.io
 
-from aeroloop.protocol.messages.models import Telemetry, Truth
+from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.outputs import OutputError
-from aeroloop.service.logs.recording import Recording, ReviewError
+from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.table import columns_of, euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read, review
@@ -92,14 +92,6 @@ def test_a_gap_stays_a_gap(parquet: Table) -> None:
     assert parquet["published_ns"] == [START_NS + k * PERIOD_NS for k in ticks]
 
 
-def test_nothing_was_commanded_where_nothing_answered(parquet: Table) -> None:
-    for row in rows(parquet):
-        answered = row["tick"] not in UNANSWERED
-        assert row["latency_us"] == (300.0 if answered and row["tick"] != TICKS - 1 else None)
-        for name in ("voltage_2_V", "voltage_3_V", "saturated_voltage_2", "saturated_voltage_3"):
-            assert (row[name] is not None) == answered
-
-
 def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: Settings) -> None:
     """Every tenth tick has one, unless the plant skipped it."""
     quantizer = settings.wire.rate.quantizer()
@@ -136,29 +128,6 @@ def test_a_plants_own_signals_reach_the_log_the_table_and_the_page(tmp_path: Pat
     ]
     drawn = panels[0].lines[0].values
     assert list(drawn[:51:10]) == pytest.approx(table["plant_angle_deg"][:51:10])
-
-
-def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
-    """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
-    published = {}
-    for _, found in Recording([log]).messages(lambda address: address if address.topic.name == "telemetry" else None):
-        telemetry = Telemetry.model_validate_json(found.data)
-        if telemetry.session == SESSION:
-            published[telemetry.tick] = telemetry
-    before: Telemetry | None = None
-    for row in rows(parquet):
-        theta = tuple(row[f"damping_estimate_{axis}_Nms_rad"] for axis in "xyz")
-        volts = row["unquantized_voltage_2_V"], row["unquantized_voltage_3_V"]
-        if row["tick"] in UNANSWERED:
-            assert (theta, volts) == ((None,) * 3, (None,) * 2)
-            continue
-        if before is not None and before.tick == row["tick"] - 1:
-            assert (theta, row["sign"]) == (before.state["damping_estimate"], before.state["sign"][0])
-        before = published.get(row["tick"])
-        if before is not None:
-            assert volts == before.voltages
-            assert tuple(row[f"attitude_error_{axis}"] for axis in "xyz") == before.attitude_error
-    assert len(published) > 30
 
 
 def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded() -> None:
@@ -308,17 +277,6 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
         export([log], "parquet", tmp_path / "a.parquet")
     assert sorted(tmp_path.iterdir()) == before
     assert (tmp_path / "there.csv").read_text() == "mine"
-
-
-def test_a_part_has_the_rows_of_the_whole(log: Path, tmp_path: Path, parquet: Table) -> None:
-    part = ("--from", "0.3", "--to", "0.5")
-    assert execute(["log", "export", str(log), "--format", "parquet", "--out", str(tmp_path / "a.parquet"), *part]) == 0
-    table = pyarrow.parquet.read_table(tmp_path / "a.parquet").to_pydict()
-    assert table["tick"] == list(range(150, 251))
-    begin = parquet["tick"].index(150)
-    for name, column in table.items():
-        if "delay" not in name:  # the clocks' offset is fitted by what is read
-            assert column == parquet[name][begin : begin + 101], name
 
 
 def test_the_command_names_the_sessions_that_it_leaves_out(

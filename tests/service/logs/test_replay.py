@@ -10,7 +10,7 @@ from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
 from aeroloop.service.review.review import review
-from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, START_NS, lockstep, made, make_log, write
+from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, lockstep, made, make_log, write
 
 TICKS = 600
 
@@ -72,14 +72,3 @@ def test_the_figures_of_a_made_log_are_those_of_the_experiment(tmp_path: Path) -
     figures, expected = review(tmp_path / "a.mcap"), run_experiment(load(), TICKS * 0.002)
     assert (figures.z_track, figures.u_total) == (expected.z_track, expected.u_total)
     assert figures.damages == []
-
-
-def test_a_folder_is_read_as_one_run_in_the_order_of_time(tmp_path: Path) -> None:
-    """Two recorders by turns, whose file names sort the other way round; the second has the last 60 ticks again."""
-    messages = made(lockstep(), TICKS)
-    write(tmp_path / "b.mcap", lockstep(), [m for m in messages if m.at_ns < START_NS + 300 * 2_000_000])
-    write(tmp_path / "a.mcap", lockstep(), [m for m in messages if m.at_ns >= START_NS + 240 * 2_000_000])
-    (tmp_path / "whole").mkdir()
-    make_log(tmp_path / "whole" / "w.mcap", TICKS)
-    parts, whole = review(tmp_path), review(tmp_path / "whole")
-    assert (parts.z_track, parts.u_total, parts.duration_s) == (whole.z_track, whole.u_total, whole.duration_s)

@@ -175,15 +175,6 @@ def test_a_viewer_of_a_running_loop_shows_what_is_well_formed(rate_hz: float | N
     assert decoder.malformed > 1000
 
 
-@pytest.mark.parametrize("payload", [b"{}", b"null", b"\xff\xfe"])
-def test_two_bytes_on_a_recorder_s_description_cost_no_replay(clean: Path, tmp_path: Path, payload: bytes) -> None:
-    key = topics.key("description", VEHICLE, role="recorder")
-    path = rewrite(clean, tmp_path / "a.mcap", more=[Said(key, START_NS + 10**8, payload)])
-    assert execute(["log", "replay", str(path)]) == 0
-    recover(path, tmp_path / "b.mcap")
-    assert execute(["log", "replay", str(tmp_path / "b.mcap"), "--json"]) == 0
-
-
 def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alone(
     clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

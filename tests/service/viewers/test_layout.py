@@ -73,11 +73,3 @@ def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytes
     assert json.loads(capfd.readouterr().out) == made("bench", 3)
     assert execute(["show", "layout", "--set", "vehicle=aero2"]) == 0
     assert json.loads(capfd.readouterr().out) == made("aero2")
-
-
-def test_a_name_that_no_vehicle_can_have_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
-    assert execute(["show", "layout", "--set", "vehicle=a/b"]) == 2
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("aeroloop: vehicle: ")
-    assert len(captured.err.splitlines()) == 1

@@ -5,11 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
-
 from aeroloop.protocol.messages import topics
 from aeroloop.service.viewers.channels import SHAPES
-from aeroloop.service.viewers.schemas import Attitude, Tracking, Voltages, json_shape, plain_schema
 from tests.support.decoded import NOW, RAW, STATUS, address, configured, said
 from tests.support.viewer_double import fields
 
@@ -56,21 +53,3 @@ def test_every_schema_is_one_that_viewers_read() -> None:
         files = [fields(file) for file in fields(shape.schema)[1]]  # a FileDescriptorSet
         declared = {(file[2][0].decode(), fields(found)[1][0].decode()) for file in files for found in file.get(4, [])}
         assert (package, message) in declared, name
-
-
-def test_fields_that_are_numbers_have_a_unit_in_their_names_or_count_something() -> None:
-    units = ("_deg", "_deg_s", "_v", "_s")
-    plain = {"damping_1", "damping_2", "damping_3", "sign"}
-    for view in (Attitude, Voltages, Tracking):
-        for name, field in plain_schema(view)["properties"].items():
-            assert field["type"] == "boolean" or name.endswith(units) or name in plain, name
-
-
-@pytest.mark.parametrize("name", [topic.name for topic in topics.TOPICS.values() if topic.kind == "json"])
-def test_messages_of_the_network_can_be_described_so_that_viewers_read_them(name: str) -> None:
-    model = topics.TOPICS[name].model
-    assert model is not None
-    schema = plain_schema(model)
-    assert readable(schema)
-    assert set(schema["properties"]) == set(model.model_fields)
-    assert json.loads(json_shape(model).schema) == schema
