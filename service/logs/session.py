@@ -1,17 +1,17 @@
-"""A session of a log: a table of rows for each end, joined on the tick."""
+"""A session of a log: a table of rows for each end, joined on the tick; and the plant's true states."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from aeroloop.protocol.messages.models import Description
+from aeroloop.protocol.messages.models import MAX_SIGNALS, Description, Truth
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import (
     NEVER,
@@ -181,3 +181,43 @@ def _places(ticks: Integers, places: npt.NDArray[np.intp], k: Integers) -> Place
         return np.full(len(k), -1, dtype=np.int32)
     at = np.minimum(np.searchsorted(ticks, k), len(ticks) - 1)
     return np.where(ticks[at] == k, places[first][at], -1).astype(np.int32)
+
+
+class TrueStates:
+    """Collects the true states of some sessions of a vehicle, by name with the number of motors."""
+
+    def __init__(self, actuators: Mapping[str, int]) -> None:
+        self._actuators = actuators
+        self._states: dict[str, dict[int, tuple[float, ...]]] = {session: {} for session in actuators}
+        self._signals: dict[str, dict[str, dict[int, float]]] = {session: {} for session in actuators}
+
+    def add(self, data: bytes) -> None:
+        """Add a message, unless it is of another session; of a tick, the first counts.
+
+        Raises:
+            ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
+        """
+        truth = Truth.model_validate_json(data)
+        if truth.session is None or truth.session not in self._actuators or (k := truth.session_tick) is None:
+            return
+        signals = self._signals[truth.session]
+        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[truth.session]:
+            raise ValueError("a true state of no tick of its session")
+        if len({*signals, *truth.signals}) > MAX_SIGNALS:
+            raise ValueError("more signals than a plant has")
+        self._states[truth.session].setdefault(k, (k, *truth.attitude, *truth.rate, *truth.voltages))
+        for name, value in truth.signals.items():
+            signals.setdefault(name, {}).setdefault(k, nan if value is None else value)
+
+    def rows(self, session: str) -> Array:
+        """Tick, q, ω and the motors' voltages, ascending. Shape (n, 8 + actuators)."""
+        rows = [row for _, row in sorted(self._states[session].items())]
+        return np.array(rows, np.float64).reshape(-1, 8 + self._actuators[session])
+
+    def signals(self, session: str) -> dict[str, Array]:
+        """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
+        ticks = sorted(self._states[session])
+        return {
+            name: np.array([values.get(k, nan) for k in ticks])
+            for name, values in sorted(self._signals[session].items())
+        }

@@ -351,6 +351,15 @@ def _levels(signal: SignalSpec) -> Array | None:
     return np.array(quantizer.levels) if isinstance(quantizer, CodedQuantizer) else None
 
 
+def euler_deg(q: Array) -> Array:
+    """Roll, pitch and yaw in degrees as `aeroloop.protocol.wire.attitude.to_euler` has them. Shape (n, 4) to (n, 3)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.asarray(np.degrees(np.column_stack((roll, pitch, yaw))))
+
+
 # ── Times ──
 
 

@@ -82,9 +82,8 @@ class RollingLog:
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
         self._base = log_path(settings.path, _BY_TIME)
-        self._runs = (
-            re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
-        )  # that are ours
+        ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
+        self._runs = re.compile(ours)
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
@@ -255,5 +254,5 @@ class RollingLog:
             _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
             if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                return run["part"] == path.stem and re.fullmatch(self._runs, run["run"]) is not None
+                return run["part"] == path.stem and self._runs.fullmatch(run["run"]) is not None
         return False

@@ -19,8 +19,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.session import Array, Integers
-from aeroloop.service.logs.table import euler_deg
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.ticks import Ticks, euler_deg
 from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel

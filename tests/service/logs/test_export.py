@@ -20,11 +20,10 @@ from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
-from aeroloop.service.logs.export import export
+from aeroloop.service.logs.export import columns_of, export
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.logs.table import columns_of, euler_deg
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.ticks import Ticks, euler_deg
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import PERIOD_NS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write

@@ -143,14 +143,14 @@ def test_a_log_of_a_killed_recorder_is_read_up_to_the_damage(
     assert recover(killed, tmp_path / "out.mcap").lost == damages
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(seed: int, tmp_path: Path) -> None:
-    """50 files each: cut, or with up to three bits flipped, some of them without their index."""
+    """30 files each: cut, or with up to three bits flipped, some of them without their index."""
     log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261201 + seed)
     make_log(log, 200, changes={120: AN_OPERATORS_WORDS[120]}, chunk_every=4, truth_every=20)
     data, clean, same = log.read_bytes(), read_run(log), replay([log])
     refused: list[str] = []
-    for _ in range(50):
+    for _ in range(30):
         bent = bytearray(data if rng.random() < 0.7 else data[: rng.randrange(len(data))])
         for _ in range(rng.randrange(4)):
             if bent:
@@ -168,7 +168,7 @@ def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_wo
             assert named
         if again.controller != same.controller or again.plant != same.plant:
             assert not again.complete or again.reasons
-    assert len(refused) < 25
+    assert len(refused) < 15
     assert all(len(line.splitlines()) == 1 for line in refused)
 
 
