@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil, inf
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -21,13 +21,7 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, End, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
-from aeroloop.service.logs.mcap_file import (
-    DESCRIPTION_METADATA,
-    RECORDER_METADATA,
-    NotMcapError,
-    messages,
-    records,
-)
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
 from aeroloop.service.logs.session import Session, SessionKey, join, table_of
 from aeroloop.service.logs.trace_index import Source, TraceIndex
 
@@ -105,7 +99,7 @@ class Recording:
     @property
     def unread(self) -> list[str]:
         """What could not be read, a line each: damages, then malformed messages."""
-        return [*self.damaged, *malformed_lines(self.malformed)]
+        return [*self.damaged, *(f"malformed: {n} of {topic}" for topic, n in sorted(self.malformed.items()) if n)]
 
     # ── sessions ──
 
@@ -149,39 +143,33 @@ class Recording:
         """
         settings = self.settings(which)
         first, last = since_s / settings.loop.period, until_s / settings.loop.period
+        acted = last + ceil(ANSWER_S / settings.loop.period)  # when the last answer acts
         unknown = [one for one in self.unknown if (one.vehicle, one.session) == which]
-        tables = {}
-        for end in ENDS:
-            until = last + (ceil(ANSWER_S / settings.loop.period) if end == "plant" else 0)  # when the last answer acts
-            its = [
-                (entry.header, entry.payload)
-                for entry in self._index.parts[which, end]
-                if entry.header.rows and entry.first <= until and entry.last >= first
-                if end == "plant" or not any(one.first_tick <= entry.last <= one.last_tick for one in unknown)
-            ]
-            tables[end], states, other_wires = table_of(end, settings.wire, its)
-            self.malformed["trace"] += other_wires
-            if end == "controller":
-                its_states = states
-        plant = tables["plant"]
-        for one in unknown:
-            plant = plant[(plant["session_tick"] < one.first_tick) | (plant["session_tick"] > one.last_tick)]
-        k, at_controller, at_plant, acted = join(tables["controller"], plant, first, last)
+        parts = {end: [one for one in self._index.parts[which, end] if one.header.rows] for end in ENDS}
+        computed = [
+            one
+            for one in parts["controller"]
+            if one.first <= last and one.last >= first
+            if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
+        ]
+        controller, states, left_out = table_of("controller", settings.wire, computed)
+        its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
+        plant, _, more_left_out = table_of("plant", settings.wire, its)
+        self.malformed["trace"] += left_out + more_left_out
+        for gap in unknown:
+            plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
         return Session(
-            which=which,
-            settings=settings,
-            descriptions=self.described(which),
-            extent=self.extents[which],
-            controller=tables["controller"],
-            plant=plant,
-            changes=[change for change in self._index.changes[which] if change.tick <= last],
-            states=its_states,
-            missing=[gap for gap in self.missing if (gap.vehicle, gap.session) == which],
-            unknown=unknown,
-            k=k,
-            at_controller=at_controller,
-            at_plant=at_plant,
-            acted=acted,
+            which,
+            settings,
+            self.described(which),
+            self.extents[which],
+            controller,
+            plant,
+            [change for change in self._index.changes[which] if change.tick <= last],
+            states,
+            [gap for gap in self.missing if (gap.vehicle, gap.session) == which],
+            unknown,
+            *join(controller, plant, first, last),
         )
 
     # ── descriptions ──
@@ -228,36 +216,26 @@ class Recording:
 
     # ── what else is in the files ──
 
-    def plants(self) -> dict[Source, tuple[Description | None, int]]:
-        """Processes of plants, with the description of each as it began, and its recorded rows."""
-        return {
-            source: (
-                self._described_at(source.vehicle, "plant", self._begun_ns[source]),
-                sum(entry.header.rows for entry in entries),
-            )
-            for source, entries in self._index.entries.items()
-            if source.end == "plant" and entries
-        }
-
-    def batches(self, sources: Iterable[Source]) -> Iterator[tuple[Source, Batch]]:
-        """All batches of some processes, each in the order of its rows and none twice."""
-        for source in sources:
-            for entry in self._index.entries[source]:
-                if (batch := read_batch(entry.payload)) is not None:
-                    yield source, batch
+    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
+        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
+        for source, entries in self._index.entries.items():
+            if source.end == "plant" and entries:
+                batches = [batch for one in entries if (batch := read_batch(one.payload)) is not None]
+                yield source, self._described_at(source.vehicle, "plant", self._begun_ns[source]), batches
 
     def messages(self, wanted: Callable[[Address], T | None]) -> Iterator[tuple[T, Message]]:
         """Messages of the keys that `wanted` selects, in the order of recording, each with its result for the key.
 
         It is called once per key of a file; None drops the key.
         """
-
-        def of(channel: Channel) -> T | None:
-            address = topics.read_key(channel.topic)
-            return None if address is None else wanted(address)
-
         for path in self.paths:
-            yield from messages(path, of)
+            answers: dict[int, T | None] = {}
+            for one in records(path):
+                if isinstance(one, Channel) and one.id not in answers:
+                    address = topics.read_key(one.topic)
+                    answers[one.id] = None if address is None else wanted(address)
+                elif isinstance(one, Message) and (answer := answers.get(one.channel_id)) is not None:
+                    yield answer, one
 
     # ── the first look at the files ──
 
@@ -303,7 +281,7 @@ class Recording:
         unreadable = list[tuple[_Copy, str]]()
         for copy in sorted(copies, key=lambda one: one[1]):
             try:
-                found = read_description(copy[2], copy[3])
+                found = _read_description(copy[2], copy[3])
             except ValueError as error:
                 unreadable.append((copy, str(error).splitlines()[0]))
             else:
@@ -344,13 +322,8 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
         )
 
 
-def read_description(text: str | bytes, address: Address | None) -> Description:
-    """Parse a description, recorded under a key.
-
-    Raises:
-        ValueError: It is malformed, of another role or vehicle than its key says, of another protocol version, or its
-            configuration is.
-    """
+def _read_description(text: str | bytes, address: Address | None) -> Description:
+    """Parse a description, recorded under a key. Raises ValueError if it is malformed, or not what its key says."""
     try:
         content = json.loads(text)
     except RecursionError:
@@ -369,15 +342,10 @@ def read_description(text: str | bytes, address: Address | None) -> Description:
     return description
 
 
-def malformed_lines(malformed: Mapping[str, int]) -> list[str]:
-    """Malformed messages by topic, a line each."""
-    return [f"malformed: {count} of {topic}" for topic, count in sorted(malformed.items()) if count]
-
-
 def _begin_ns(path: Path) -> int:
     """When a file's first message was recorded [ns since 1970]; 0 without any. Raises ReviewError."""
     try:
-        return next((one.log_time for _, one in messages(path, lambda _: True)), 0)
+        return next((one.log_time for one in records(path) if isinstance(one, Message)), 0)
     except NotMcapError as error:
         raise ReviewError(f"{error}, so it is no log") from None
     except OSError as error:

@@ -21,13 +21,12 @@ from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
-from aeroloop.service.logs.trace_index import Source
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -238,43 +237,42 @@ def _replay_plants(
     Returns the result of each process, the reason if there is none or one ends early, which rows are not compared, and
     the first difference in words.
     """
-    replays: dict[Source, PlantReplay] = {}
-    reasons: dict[Source, str] = {}
-    wires: dict[Source, WireSpec] = {}
-    rows: dict[Source, int] = {}
-    for source, (description, count) in recording.plants().items():
-        if description is None:
-            reasons[source], rows[source] = f"the log has no description of {source.vehicle}'s plant", count
-            continue
-        its = from_description(description.config)
-        if (why := why_not(its.plant)) is not None:  # no log of it could be compared
-            reasons[source] = why
-            continue
-        rows[source] = count
-        try:
-            replays[source], wires[source] = PlantReplay(its.loop, its.wire, its.plant), its.wire
-        except PlantError as error:
-            reasons[source] = str(error)
-    done, total = 0, max(1, sum(rows.values()))
-    for source, batch in recording.batches(replays):
-        replays[source].feed(batch)
-        done += batch.header.rows
-        if progress is not None:
-            progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * min(1.0, done / total))
-    results = {source: one.result() for source, one in replays.items()}
-    reasons |= {source: one.stopped for source, one in results.items() if one.stopped is not None}
+    results, reasons = list[PlantReplayed](), list[str]()
     unseen, details = list[str](), list[str]()
-    for source, count in rows.items():
-        if (left := count - (results[source].ticks if source in results else 0)) > 0:
-            unseen.append(f"{left} of the plant's rows: {reasons.get(source, 'a batch of them cannot be read')}")
-    for source, one in results.items():
-        first, wire = one.first_difference, wires[source]
-        if first is not None and first.field == "measurement" and not details:
-            signals = [(f"ε{i}", "", wire.attitude) for i in (1, 2, 3)]
-            signals += [(f"ω{i}", " rad/s", wire.rate) for i in (1, 2, 3)]
-            details = _in_units(wire.measurement, signals, *map(bytes.fromhex, (first.logged, first.computed)))
+    plants = list(recording.plants())
+    done, total = 0, max(1, sum(batch.header.rows for *_, batches in plants for batch in batches))
+    for source, description, batches in plants:
+        left, reason = sum(batch.header.rows for batch in batches), None
+        if description is None:
+            reason = f"the log has no description of {source.vehicle}'s plant"
+        else:
+            its = from_description(description.config)
+            if (why := why_not(its.plant)) is not None:  # no log of it could be compared
+                reasons.append(why)
+                continue
+            try:
+                one = PlantReplay(its.loop, its.wire, its.plant)
+            except PlantError as error:
+                reason = str(error)
+            else:
+                for batch in batches:
+                    one.feed(batch)
+                    done += batch.header.rows
+                    if progress is not None:
+                        progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * done / total)
+                results.append(result := one.result())
+                left, reason, first = left - result.ticks, result.stopped, result.first_difference
+                if first is not None and first.field == "measurement" and not details:
+                    signals = [(f"ε{i}", "", its.wire.attitude) for i in (1, 2, 3)]
+                    signals += [(f"ω{i}", " rad/s", its.wire.rate) for i in (1, 2, 3)]
+                    frames = map(bytes.fromhex, (first.logged, first.computed))
+                    details = _in_units(its.wire.measurement, signals, *frames)
+        if reason is not None:
+            reasons.append(reason)
+        if left > 0:
+            unseen.append(f"{left} of the plant's rows: {reason or 'a batch of them cannot be read'}")
     none = None if results else "the log has no trace of a plant"
-    return list(results.values()), next(iter(reasons.values()), none), unseen, details
+    return results, next(iter(reasons), none), unseen, details
 
 
 def _in_units(

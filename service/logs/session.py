@@ -126,16 +126,35 @@ class Session:
     acted: Places
 
 
-def table_of(
-    end: End, wire: WireSpec, batches: Sequence[tuple[Header, bytes]]
-) -> tuple[Table, dict[int, dict[str, Any]], int]:
+class Entry(NamedTuple):
+    """A batch of a trace, as it was recorded."""
+
+    header: Header
+    payload: bytes
+    first: int  # tick of the first row
+    last: int  # highest tick; a late row is of an earlier one
+    proof: int  # a tick of the other end whose row there must be
+    changes: list[Change]
+    record: list[Change]
+
+    @property
+    def after(self) -> int:
+        """Number of the first row after it."""
+        return self.header.first_row + self.header.rows
+
+
+def table_of(end: End, wire: WireSpec, batches: Sequence[Entry]) -> tuple[Table, dict[int, dict[str, Any]], int]:
     """One end's rows, from batches in order.
 
     Returns:
         The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
     sizes = wire.measurement.size, wire.command.size, wire.actuators
-    fitting = [one for one in batches if (one[0].measurement_bytes, one[0].command_bytes, one[0].actuators) == sizes]
+    fitting = [
+        (header, payload)
+        for header, payload, *_ in batches
+        if (header.measurement_bytes, header.command_bytes, header.actuators) == sizes
+    ]
     kinds = row_dtype(end, *sizes)
     wide = {"tick", "session_tick", "answered", "received", "sent"}
     columns = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or ()]

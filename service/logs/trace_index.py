@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import ENDS, NEVER, Batch, End, Header, Received, read_batch
-from aeroloop.service.logs.session import NO_TICK, Extent, Integers, Missing, SessionKey, Unknown
+from aeroloop.protocol.messages.trace import ENDS, NEVER, Batch, End, Received, read_batch
+from aeroloop.service.logs.session import NO_TICK, Entry, Extent, Integers, Missing, SessionKey, Unknown
 
 _MOST: Final = 1 << 62
 """More rows than any process publishes, and more nanoseconds than any clock counts."""
@@ -36,23 +36,6 @@ class Source(NamedTuple):
     vehicle: str
     end: End
     run: int
-
-
-class Entry(NamedTuple):
-    """A batch in the index."""
-
-    header: Header
-    payload: bytes
-    first: int  # tick of the first row
-    last: int  # highest tick; a late row is of an earlier one
-    proof: int  # a tick of the other end whose row there must be
-    changes: list[Change]
-    record: list[Change]
-
-    @property
-    def after(self) -> int:
-        """Number of the first row after it."""
-        return self.header.first_row + self.header.rows
 
 
 class TraceIndex:

@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.records import Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.copies import RecoverError, recover
-from aeroloop.service.logs.mcap_file import messages
+from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.recording import rolling
 from aeroloop.service.settings import RecorderSettings
 from tests.support.made_log import make_log
@@ -61,8 +61,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ours(path: Path) -> dict[str, dict[str, Any]]:
     """What our own reader finds of each topic: messages, bytes, the first and the last log time [ns]."""
     found: defaultdict[str, list[Message]] = defaultdict(list)
-    for channel, message in messages(path, lambda channel: channel.topic):
-        found[channel].append(message)
+    names: dict[int, str] = {}
+    for record in records(path):
+        if isinstance(record, Channel):
+            names[record.id] = record.topic
+        elif isinstance(record, Message):
+            found[names[record.channel_id]].append(record)
     return {
         topic: {
             "count": len(its),

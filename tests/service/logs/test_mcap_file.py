@@ -19,7 +19,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.logs.copies import RecoverError, recover
-from aeroloop.service.logs.mcap_file import MAX_CHUNK, messages, records
+from aeroloop.service.logs.mcap_file import MAX_CHUNK, records
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
@@ -71,8 +71,6 @@ def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
     damages: list[str] = []
     assert read(whole, damages) == everything
     assert damages == []
-    named = messages(whole, lambda channel: channel.topic.endswith("/telemetry") or None)
-    assert [one.data for _, one in named] == [one.data for one in everything if one.topic.endswith("/telemetry")]
     assert recover(whole, tmp_path / "out.mcap").lost == []
     assert by_mcap(tmp_path / "out.mcap") == everything
     assert Recording([tmp_path / "out.mcap"]).descriptions == Recording([whole]).descriptions
@@ -246,7 +244,7 @@ def test_what_a_file_claims_costs_no_memory_and_is_damage(tmp_path: Path, whole:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert f"(byte {first}" in damages[0]
-    assert peak < 10 * len(block) + 1_000_000
+    assert peak < 10 * len(block) + MAX_CHUNK + 1_000_000
 
 
 def test_an_index_of_which_a_bit_flipped_is_not_used_and_costs_nothing(
