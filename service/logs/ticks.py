@@ -188,12 +188,16 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     table, widths, missed = _computed(session, progress)
     valid = ~np.isnan(table[:until, widths[0]])  # where q was measured
     judged: slice | Integers = slice(until) if valid.all() else np.flatnonzero(valid)  # a slice copies nothing
-    *times, offset_ns = _timed(session)
+    wall, sent, latency, there, back, offset_ns = _timed(session)
     volts = _voltages(session)
-    state, q, state_next, *law, u = np.split(table[judged], np.cumsum(widths)[:-1], axis=1)
+    columns = [np.asarray(part) for part in np.split(table[judged], np.cumsum(widths)[:-1], axis=1)]
+    state, q, state_next, desired, rate, attitude_error, rate_error, unquantized = columns
     k, gains = session.k[judged], _gains(session, session.k[judged])
     return Recomputed(
-        ticks=Ticks(k, *(time[judged] for time in times), q, *law, volts[judged], u, gains, state, state_next),
+        ticks=Ticks(
+            k, wall[judged], sent[judged], latency[judged], there[judged], back[judged], q, desired, rate,
+            attitude_error, rate_error, volts[judged], unquantized, gains, state, state_next,
+        ),
         answered=session.k[answered],
         voltages=volts[answered],
         missed=session.k[missed[missed < until]],
@@ -201,7 +205,7 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
         measurements=codes_in(wire.measurement, frames),
         commands=codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]]),
         offset_ns=offset_ns,
-    )
+    )  # fmt: skip
 
 
 def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[int], Integers]:
@@ -212,7 +216,7 @@ def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[
     logged = LoggedController(session)
     outputs = logged.controller.outputs
     names = list(outputs)[: list(outputs).index("u") + 1]
-    state, row = np.frombuffer(logged.controller.last_valid["state_next"]), np.frombuffer(logged.controller.row)
+    state, row = np.asarray(logged.controller.last_valid["state_next"]), np.asarray(logged.controller.row)
     widths = [len(state), *(len(outputs[name]) for name in names)]
     columns = dict(zip(names, pairwise(np.cumsum(widths).tolist()), strict=True))
     table = np.full((len(session.k), sum(widths)), nan)

@@ -15,6 +15,7 @@ from typing import Any, Final
 from cantools.database.can import Database, Message, Node, Signal
 from cantools.database.can.formats.dbc import DbcAttribute, DbcAttributeDefinition, DbcSpecifics
 from cantools.database.conversion import BaseConversion
+from cantools.typechecking import Choices
 
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION
 from aeroloop.protocol.messages.states import PlantState, TripCause
@@ -109,7 +110,8 @@ def _unsigned(name: str, width: int, comment: str, choices: dict[int, str] | Non
 def _quantized(quantity: tuple[str, str, str, SignalSpec]) -> dict[str, Any]:
     """Arguments of a quantized signal, from its name, comment, unit and quantizer."""
     name, comment, unit, spec = quantity
-    quantizer, scale, choices = spec.quantizer(), 1.0, None
+    quantizer, scale = spec.quantizer(), 1.0
+    choices: Choices | None = None
     if not isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
         top = quantizer.limit
         comment += " IEEE 754 double; NaN means: no valid value."

@@ -16,7 +16,7 @@ from typing import Final
 
 import foxglove
 import zenoh
-from zenoh.handlers import RingChannel
+from zenoh.handlers import Handler, RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
@@ -109,7 +109,7 @@ def serve(
                         outlet.send(message)
 
 
-def _taken(ring: zenoh.Subscriber[zenoh.Sample], room: int) -> Iterator[Delivery]:
+def _taken(ring: zenoh.Subscriber[Handler[zenoh.Sample]], room: int) -> Iterator[Delivery]:
     """What waits in a ring: of a streaming topic the newest message, of another all."""
     for _ in range(room):
         if (sample := ring.try_recv()) is None:
