@@ -6,7 +6,7 @@ import csv
 import errno
 import json
 from collections.abc import Iterator
-from math import isnan, nan, radians
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,13 @@ import pytest
 import scipy.io
 
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import columns_of, export
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.logs.ticks import Ticks, euler_deg
+from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import PERIOD_NS
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
@@ -217,16 +216,6 @@ def test_every_column_names_its_unit_and_the_file_its_configuration(
     assert facts["aeroloop.exported_by"]["aeroloop"]
 
 
-def test_roll_pitch_and_yaw_are_the_protocols() -> None:
-    rng = np.random.default_rng(1)
-    q = rng.normal(size=(200, 4))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    q[0] = np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0  # nose up
-    expected = np.array([to_euler(tuple(row)) for row in q])
-    np.testing.assert_allclose(np.radians(euler_deg(q)), expected, rtol=0, atol=1e-12)
-    assert radians(90) == pytest.approx(expected[0, 1])
-
-
 def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Path, tmp_path: Path) -> None:
     def ticks(session: str | None) -> list[tuple[str, int]]:
         out = tmp_path / f"{session}.parquet".replace("/", "-")
@@ -281,12 +270,3 @@ def test_the_command_names_the_sessions_that_it_leaves_out(
         printed = capfd.readouterr().out
         assert (f"not exported of this log: {VEHICLE}/{left_out};" in printed) == bool(left_out)
         assert ("not exported" in printed) == bool(left_out)
-
-
-def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
-        assert execute(["log", "export", str(log), "--format", to, "--json"]) == 0
-        result = json.loads(capfd.readouterr().out)
-        out = Path(result["out"])
-        assert (out, result["bytes"]) == (log.with_name(name), out.stat().st_size)
-        out.unlink()

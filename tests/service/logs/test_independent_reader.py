@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import subprocess
 from collections import Counter, defaultdict
@@ -20,7 +19,6 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.copies import RecoverError, recover
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.recording import rolling
 from aeroloop.service.settings import RecorderSettings
@@ -117,26 +115,6 @@ def test_the_files_of_a_rotated_run(
     for path in files:
         together.update({topic: its["count"] for topic, its in ours(path).items()})
     assert together == {topic: its["count"] for topic, its in recorded.items()}
-
-
-def test_what_was_recovered_of_a_log_cut_anywhere_and_of_a_damaged_one(
-    reader: Reader, whole: Path, tmp_path: Path
-) -> None:
-    data, rng = whole.read_bytes(), random.Random(7)
-    broken = [tmp_path / f"cut-{i}.mcap" for i in range(10)]
-    for i, path in enumerate(broken):  # a tenth each, so that some are short and some almost whole
-        path.write_bytes(data[: (i * len(data) + rng.randrange(len(data))) // 10])
-    broken.append(with_a_damaged_chunk(whole, tmp_path / "damaged.mcap"))
-    recovered = []
-    for path in broken:
-        out = path.with_suffix(".recovered.mcap")
-        try:
-            recover(path, out)
-            recovered.append(out)
-        except RecoverError:
-            continue  # cut before the end of the first chunk
-    assert len(recovered) >= len(broken) - 3
-    assert_all_read(reader, *recovered)
 
 
 def test_the_reader_turns_away_what_is_not_whole(reader: Reader, whole: Path, tmp_path: Path) -> None:

@@ -12,9 +12,7 @@ import pytest
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.report.page import page
-from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.review import read, report
+from aeroloop.service.review.review import read
 from tests.support.edited_log import Said, rewrite
 from tests.support.made_log import lockstep, make_log
 from tests.support.mcap_parts import chunks, with_a_damaged_chunk
@@ -147,13 +145,3 @@ def test_what_is_explicitly_permitted_to_be_missing_fails_no_requirement(
     assert Verdict(capsys, "review", damaged, *limits, "--require", "damages=1").code == 0
     fewer = ["--require", "z_track=1", "--require", f"missing_ticks={missing - 1}", "--require", "damages=1"]
     assert Verdict(capsys, "review", damaged, *fewer).code == 1
-
-
-def test_a_comparison_and_a_page_say_it_too(damaged: Path, whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    verdict = Verdict(capsys, "compare", whole, damaged, "--require", "z_track=1")
-    assert verdict.code == 1
-    assert verdict.err.startswith("aeroloop: damaged: z_track ≤ 1 s does not hold: 0.")
-    assert "but not seen: " in verdict.err
-    html = page([report([damaged], [Limit.parse("z_track=1")])])
-    assert "1 of 1 limit broken" in html
-    assert "but not seen: " in html

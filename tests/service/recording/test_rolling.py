@@ -328,18 +328,6 @@ def test_a_crash_costs_what_came_since_the_last_chunk_was_due(tmp_path: Path, mo
     run.log.close()
 
 
-def test_a_chunk_is_written_when_it_is_large_though_it_is_not_yet_due(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rolling, "CHUNK_S", 60.0)
-    run = Run(tmp_path / "a.mcap")
-    before = disk.calls
-    run.take(1000)
-    assert disk.calls - before >= 4
-    assert len(numbers(tmp_path / "a.mcap")) > 700
-    run.log.close()
-
-
 def test_no_log_is_written_over_and_where_none_can_be_made_one_line_names_it(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"mine")
     for _ in range(2):
