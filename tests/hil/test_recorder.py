@@ -58,7 +58,7 @@ def assert_whole(logs: Path, at_least: int) -> Findings:
 def test_a_rotated_run_in_lockstep_holds_every_tick_and_is_reviewed_and_replayed_as_a_whole(tmp_path: Path) -> None:
     """20 seconds of the law take more than a file, with the specification in it, may."""
     with Hil(tmp_path, lockstep=True) as hil:
-        hil.start(settings={"recorder.max_file_mb": 0.3})
+        hil.start(settings={"recorder.max_file_mb": 0.2})
         hil.run(20.0)
     files = Recording([tmp_path]).paths
     assert len(files) >= 2
