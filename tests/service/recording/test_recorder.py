@@ -330,7 +330,7 @@ def test_a_recorder_that_is_stopped_writes_what_waited_or_reports_how_much_the_d
     running.end()
     if full:
         count, _, rest = str(running.error).partition(" ")
-        assert int(count) >= 29
+        assert 10 <= int(count) <= 40  # what is still on its way is not received; the recorder's own are counted, too
         assert rest.startswith(f"messages and the index of {running.path} could not be written")
     else:
         assert running.error is None
