@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+from aeroloop.plant_emulator.hosts.emulator import run_emulator
 from aeroloop.protocol.messages.models import Percentiles, Status, Timing
 from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
 from aeroloop.protocol.runtime.node import Node
@@ -153,11 +153,10 @@ def ends(network: NetworkSettings, *, require_recorder: bool) -> Iterator[None]:
     ]
     settings = load(overrides=[*words, "plant.armed_at_start=true", f"controller.require_recorder={require_recorder}"])
     with Node("plant", "aero", network, {}) as plant, Node("controller", "aero", network, {}) as controller:
-        loops = [
-            EmulatorOnZenoh(plant, settings.loop, settings.wire, settings.plant).run,
-            Daemon(controller, settings).run,
+        threads = [
+            threading.Thread(target=run_emulator, args=(plant, settings.loop, settings.wire, settings.plant)),
+            threading.Thread(target=Daemon(controller, settings).run),
         ]
-        threads = [threading.Thread(target=loop) for loop in loops]
         for thread in threads:
             thread.start()
         try:
