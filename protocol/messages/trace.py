@@ -224,13 +224,18 @@ def read_batch(payload: bytes) -> Batch | None:
         tail = Tail.model_validate_json(payload[-tail_bytes:]) if tail_bytes else Tail()
     except ValidationError:
         return None
-    columns, at = Columns(), HEADER_BYTES
+    return Batch(header, read_columns(header, payload), tail)
+
+
+def read_columns(header: Header, payload: bytes) -> Columns:
+    """Columns of a well-formed batch, by name; read-only but for those of steps."""
+    columns, kinds, at = Columns(), header.row_dtype, HEADER_BYTES
     for field in kinds.names or ():
         kind = kinds[field]
-        column = np.frombuffer(payload, kind.base, rows * prod(kind.shape), at)
+        column = np.frombuffer(payload, kind.base, header.rows * prod(kind.shape), at)
         at += column.nbytes
         columns[field] = np.add.accumulate(column, dtype=kind) if field in STEPS else column.reshape(-1, *kind.shape)
-    return Batch(header, columns, tail)
+    return columns
 
 
 class TraceWriter:

@@ -99,7 +99,7 @@ def unit(name: str, source: Source) -> str:
         configured = source.settings.plant.state_directory
         rights.append(f"ReadWritePaths={_quoted(str(configured))}" if configured else "StateDirectory=aeroloop")
     if name == "recorder":
-        words += ["--set", "recorder.directory=%L/aeroloop"]
+        words += ["--set", "recorder.path=%L/aeroloop"]
         rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
     elif name == "router":
         rights.append("CapabilityBoundingSet=")
