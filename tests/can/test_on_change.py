@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
@@ -14,7 +13,6 @@ from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import (
     COMMAND_ID,
     HEARTBEAT_S,
-    MEASUREMENT_ID,
     CanSettings,
     Heartbeat,
     fingerprint,
@@ -22,7 +20,7 @@ from aeroloop.protocol.transport.can_format import (
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.figures import Figures, figures
@@ -31,32 +29,17 @@ from tests.support.can_in_process import Stranger, virtual
 from tests.support.simulated_link import wire_of
 from tests.support.zenoh_network import PATIENCE_S
 
-POLICIES: list[tuple[Policy, Policy]] = [
-    ("on_change", "on_change"),
-    ("on_change", "periodic"),
-    ("periodic", "on_change"),
-]
-
-
 BOTH = wire_of("on_change", "on_change")
+WIRES = {"classic": WireSpec(), "FD": WireSpec().with_bits("12/16"), "on change": BOTH}
 
 
-WIRES = {"classic": WireSpec(), "FD": WireSpec().with_bits("12/16")} | {"-".join(p): wire_of(*p) for p in POLICIES}
-
-
-@pytest.mark.parametrize("interface", ["virtual", "socketcan"])
 @pytest.mark.parametrize("wire", WIRES)
 def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
-    interface: str, wire: str, monkeypatch: pytest.MonkeyPatch
+    wire: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
-    bus = virtual(fd=wire == "FD")
-    if interface == "socketcan":
-        if not Path("/sys/class/net/vcan0").exists():
-            pytest.skip("there is no vcan0: modprobe vcan, ip link add vcan0 mtu 72 type vcan, ip link set vcan0 up")
-        bus = CanSettings(interface="socketcan", channel="vcan0", fd=wire == "FD")
     settings = load(overrides=["loop.lockstep=true"]).model_copy(update={"wire": WIRES[wire]})
-    on_bus, direct = run_on_bus(bus, settings, 0.5), run_experiment(settings, 0.5)
+    on_bus, direct = run_on_bus(virtual(fd=wire == "FD"), settings, 0.5), run_experiment(settings, 0.5)
     assert on_bus.model_dump(exclude={"reasons"}) == direct.model_dump(exclude={"reasons"})
 
 
@@ -108,28 +91,21 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
     )
 
 
-# The link
-
-
-@pytest.mark.parametrize("end", ["plant", "controller"])
-@pytest.mark.parametrize("lockstep", [False, True])
-@pytest.mark.parametrize("wire", [WireSpec(), *(wire_of(*policies) for policies in POLICIES)], ids=str)
+@pytest.mark.parametrize(("wire", "lockstep"), [(BOTH, True), (BOTH, False), (WireSpec(), True)], ids=str)
 def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_silence_sends(
-    wire: WireSpec, lockstep: bool, end: str
+    wire: WireSpec, lockstep: bool
 ) -> None:
     bus = virtual()
-    policy = wire.transmit.command if end == "plant" else wire.transmit.measurement
-    link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
+    link = CanLink(bus, wire, "plant", lockstep=lockstep)
     try:
         with Stranger(bus) as stranger:
-            frame = bytes((wire.command if end == "plant" else wire.measurement).size)
-            identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
-            stranger.say(identifier, frame)
-            stranger.say(identifier, UNCHANGED)
+            frame = bytes(wire.command.size)
+            stranger.say(COMMAND_ID + 1, frame)
+            stranger.say(COMMAND_ID + 1, UNCHANGED)
             stranger.settle(link)
             arrival = link.take()
             assert arrival is not None
-            expected = lockstep and policy == "on_change"
+            expected = lockstep and wire == BOTH
             assert (arrival.frame, link.refused) == ((UNCHANGED, 0) if expected else (frame, 1))
     finally:
         link.close()

@@ -150,24 +150,6 @@ def test_what_a_cache_still_has_is_delivered_exactly_once_and_what_is_lost_is_co
     assert lost == len(set(range(made.count if since is None else since, made.count)) - set(made.found))
 
 
-def test_the_newest_is_queried_first_and_order_waits_for_nothing() -> None:
-    made = Made(1000, size=PAGE_BYTES // 10)
-    for _ in range(100):
-        made.publish()
-    made.receive(made.publish())
-    assert made.take() == [100]
-    asked, handler = made.queries.pop()
-    made.reply(handler, made.answer(asked))
-    first = made.take()
-    assert first == sorted(first)
-    assert first[-1] == 99
-    assert 5 < len(first) < 15
-    made.receive(made.publish())
-    assert made.take() == [101]
-    made.answer_all()
-    assert sorted(made.found) == list(range(102))
-
-
 def test_after_outages_in_any_order_nothing_is_given_up_while_its_publisher_may_have_it() -> None:
     """Nothing of it was received for a minute, in the midst of what it has to catch up with."""
     made = Made(1000, size=PAGE_BYTES // 10)
@@ -269,20 +251,6 @@ def test_publishers_and_ranges_that_are_known_are_bounded_and_what_is_given_up_i
     made.take()
     ((asked, _),) = made.queries
     assert asked == query([(OURS, (number, number + 1)) for number in range(2 * MOST + 1, 1, -2)])
-
-
-def test_one_that_does_not_answer_delays_no_page_of_the_others() -> None:
-    made = Made(10_000, size=PAGE_BYTES // 2)
-    for _ in range(20):
-        made.publish()
-    for _ in range(20):
-        made.now += 0.025
-        made.take()
-        ((asked, handler),) = made.queries
-        made.queries.clear()
-        made.reply(handler, made.answer(asked))  # and is never complete
-    made.take()
-    assert sorted(made.found) == list(range(20))
 
 
 @given(st.binary(max_size=200))

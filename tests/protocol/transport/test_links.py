@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Container, Iterator
@@ -37,25 +36,6 @@ def test_a_mailbox_gives_each_frame_once_and_a_new_one_replaces_the_oldest(
             since = arrival.at_ns
         else:
             assert not expected
-
-
-def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
-    """Two threads wait for each other in turn: one wake-up that is missed would take the whole timeout."""
-    there, back, rounds = Mailbox(), Mailbox(), 200
-
-    def echo() -> None:
-        for _ in range(rounds):
-            if (arrival := there.wait(PATIENCE_S)) is not None:
-                back.put(arrival.frame)
-
-    thread = threading.Thread(target=echo, daemon=True)
-    thread.start()
-    started = time.monotonic()
-    for i in range(rounds):
-        there.put(b"%d" % i)
-        assert receive(back) == b"%d" % i
-    thread.join(PATIENCE_S)
-    assert time.monotonic() - started < PATIENCE_S
 
 
 def receive(at: Link | Mailbox, wait_s: float = PATIENCE_S) -> bytes | None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 
 import pytest
 import zenoh
@@ -103,41 +101,11 @@ def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() 
         assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), None)
 
 
-@contextmanager
-def rude_program() -> Iterator[int]:
-    """A port held by a program that is not Zenoh and hangs up on every caller."""
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        server.listen()
-
-        def hang_up() -> None:
-            while True:
-                try:
-                    caller, _ = server.accept()
-                except OSError:
-                    return
-                caller.close()
-
-        thread = threading.Thread(target=hang_up, daemon=True)
-        thread.start()
-        try:
-            yield server.getsockname()[1]
-        finally:
-            server.shutdown(socket.SHUT_RDWR)
-            thread.join()
-
-
 def one_line(error: BaseException) -> str:
     text = str(error)
     assert text
     assert "\n" not in text
     return text
-
-
-def test_a_port_held_by_another_program_is_passed_over() -> None:
-    with Gathering() as gathering, rude_program() as port:
-        linked([gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"]))])
-        assert accepts(port)
 
 
 @pytest.mark.parametrize(("protocol", "kind"), [("tcp", socket.SOCK_STREAM), ("udp", socket.SOCK_DGRAM)])
