@@ -10,10 +10,8 @@ from typing import Any, Final, get_args
 from pydantic import BaseModel, BeforeValidator, ValidationError
 from pydantic.fields import FieldInfo
 
-SHOWN: Final = 60
-"""Characters of a refused value or an unknown key that are shown."""
-_SAID: Final = 600
-"""Characters of pydantic's words that are shown: they may quote what was given."""
+SHOWN: Final = 60  # characters of a refused value or an unknown key
+_SAID: Final = 600  # characters of pydantic's words, which may quote what was given
 
 
 def keys(model: type[BaseModel], section: str = "") -> dict[str, FieldInfo]:
@@ -63,21 +61,14 @@ def problems(error: ValidationError, *models: type[BaseModel]) -> Iterator[str]:
             yield f"{shown} is no key of this kind"
         else:
             said = _line(each["msg"].removeprefix("Value error, ").removeprefix("Input "), _SAID)
+            value = json.dumps(each["input"], ensure_ascii=False, default=repr, skipkeys=True)
             of_whole = each["type"] in ("missing", "json_invalid") or isinstance(each["input"], dict | BaseModel)
-            given = "" if of_whole else f", not {_line(_json(each['input']), SHOWN)}"
-            yield f"{shown}: {said}".removeprefix(": ") + given
+            yield f"{shown}: {said}".removeprefix(": ") + ("" if of_whole else f", not {_line(value, SHOWN)}")
 
 
 def problem(error: ValidationError, *models: type[BaseModel]) -> str:
     """What is wrong first: one line, however many errors there are."""
     return next(problems(error, *models))
-
-
-def _json(value: object) -> str:
-    try:
-        return json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):
-        return repr(value)
 
 
 def _line(text: str, length: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from aeroloop.service.config_sources import Target
     from aeroloop.service.terminal.show import Sheets
 
-log: Final = logging.getLogger("aeroloop")
-
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
 PAPER_DURATION_S: Final = 50.0
@@ -30,8 +27,6 @@ PAPER_DURATION_S: Final = 50.0
 Result = TypeVar("Result", bound="BaseModel")
 
 state = {"debug": False}
-logged_as: list[str] = []
-"""The role of a daemon that logs JSON, so that its last error is a line of JSON, too; empty in other commands."""
 
 Config = Annotated[Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.")]
 Overrides = Annotated[
@@ -76,11 +71,8 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def report(message: str) -> None:
-    """Print an error as one line on stderr, or log it where a daemon logs JSON."""
-    if logged_as:
-        log.critical(message, extra={"event": "failed", "role": logged_as[0]})
-    else:
-        typer.echo(f"aeroloop: {message}", err=True)
+    """Print an error as one line on stderr."""
+    typer.echo(f"aeroloop: {message}", err=True)
 
 
 def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:

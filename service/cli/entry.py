@@ -15,8 +15,8 @@ import sys
 INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
 
-DAEMONS = {"controller": "controller", "plant": "plant", "can-node": "node", "router": "router", "recorder": "recorder"}
-"""Verbs that run until SIGTERM, with exit code 0, and the role that each logs as."""
+DAEMONS = ("controller", "plant", "can-node", "router", "recorder")
+"""Verbs that run until SIGTERM, with exit code 0."""
 
 
 def end_at_once(*_: object) -> None:
@@ -34,14 +34,11 @@ def end_unstarted(*_: object) -> None:
 
 def main() -> None:
     """Entry point of the command."""
-    verb = next((word for word in sys.argv[1:] if not word.startswith("--") and word not in ("text", "json")), "")
-    if verb in DAEMONS:
+    if next((word for word in sys.argv[1:] if not word.startswith("--")), "") in DAEMONS:
         signal.signal(signal.SIGTERM, end_unstarted)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in a background job
         signal.signal(signal.SIGINT, end_at_once)
-    # No matrix here is worth a thread on each core; for plug-ins pydantic would read every package's metadata.
-    for switch, value in (("OPENBLAS_NUM_THREADS", "1"), ("PYDANTIC_DISABLE_PLUGINS", "__all__")):
-        os.environ.setdefault(switch, value)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # no matrix here is worth a thread on each core
     from aeroloop.service.cli.main import execute
 
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -6,16 +6,11 @@ left out, and what was not received for `SILENT_S` is marked with its age.
 
 from __future__ import annotations
 
-import os
-import select
-import sys
-import termios
 import threading
 import time
-import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import degrees
 from typing import Final
@@ -117,7 +112,7 @@ def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now:
 
 
 def watch(network: NetworkSettings) -> None:
-    """Subscribe, and draw five times a second until `q` is pressed, or ^C.
+    """Subscribe, and draw five times a second until ^C.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -133,39 +128,12 @@ def watch(network: NetworkSettings) -> None:
 
     with (
         join(network, listen=False) as session,
-        keyboard() as wait_for_keys,
         Live(console=console, auto_refresh=False, screen=console.is_terminal) as live,
     ):
         session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
-        live.update(top.draw(console.width), refresh=True)
-        while "q" not in wait_for_keys(REFRESH_S):
-            live.update(top.draw(console.width), refresh=True)
-
-
-@contextmanager
-def keyboard() -> Iterator[Callable[[float], str]]:
-    """A function that waits up to a time [s] for keys and returns them, `q` where the terminal is gone.
-
-    Where stdin is no terminal it only waits. The terminal's mode is restored at the end.
-    """
-    terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
-
-    def keys(wait_s: float) -> str:
-        if terminal is None:
-            time.sleep(wait_s)
-        elif select.select([terminal], [], [], wait_s)[0]:
-            pressed = os.read(terminal, 64).decode(errors="ignore") or "q"
-            return "" if pressed.startswith("\x1b") else pressed  # an arrow key, for example
-        return ""
-
-    if terminal is None:
-        yield keys
-        return
-    before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)
-    try:
-        yield keys
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        with suppress(KeyboardInterrupt):
+            while True:
+                live.update(top.draw(console.width), refresh=True)
+                time.sleep(REFRESH_S)

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import getpass
-import shlex
 import signal
 from datetime import UTC, datetime
 from math import degrees
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from aeroloop.plant_emulator.hosts.latch_file import Latch
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Truth
-from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid, Track
+from aeroloop.protocol.messages.operator import Gains, Hold, Request, Sinusoid, Track
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.service.config import load
-from aeroloop.service.host.operator import send, show
+from aeroloop.service.host.operator import send
 from aeroloop.service.lab.demo import run_demo
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.testing.hil import Hil
 from tests.hil.test_faults import PATIENT
-from tests.hil.test_operate import done
 
 TARGET = Hold(attitude=(0.0, -10.0, 30.0))
 SET = Gains(C1=(0.4, 0.4, 0.4), C2=(0.2, 0.2, 0.2), Gamma=(0.02, 0.02, 0.02))
@@ -69,8 +70,14 @@ def test_yesterdays_stop_surprises_no_demo(tmp_path: Path) -> None:
 
 
 def shown(hil: Hil, *, last: bool = False) -> SessionRecord:
-    """What `op show` reads."""
-    return show(hil.settings.network, "aero", last=last)
+    """What the controller follows; with `last` the plant's record of the session that ended."""
+    with command_session(hil.settings.network) as here:
+        here.wait_for_links()
+        key, request = topics.key("show", "aero"), Request().encode()
+        replies = here.session.get(key, payload=request, timeout=1.0, consolidation=zenoh.ConsolidationMode.NONE)
+        payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    records = [SessionRecord.model_validate_json(each) for each in payloads if b'"controller"' in each]
+    return next(record for record in records if (record.ended is not None) == last)
 
 
 @pytest.mark.parametrize("after_restart", ["hold", "resume", "configured"])
@@ -98,11 +105,6 @@ def test_what_a_controller_that_was_killed_does_when_it_is_started_again(hil: Hi
     assert after.session == status.session != before.session
     if after_restart == "hold":
         assert (after.reference_from, after.gains, after.gains_from) == ("held", CONFIGURED, "configured")
-        pasted = done(hil, "show").splitlines()[1]
-        verb, *words = shlex.split(pasted, comments=True)[2:]
-        done(hil, verb, *words[: words.index("--set")])
-        now = shown(hil)
-        assert (now.reference, now.reference_from) == (after.reference, "operator")
     elif after_restart == "resume":
         assert (after.reference, after.reference_from) == (TARGET, "resumed")
         assert (after.gains, after.gains_from) == (SET, "resumed")

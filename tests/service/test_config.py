@@ -28,37 +28,12 @@ KINDS: dict[str, tuple[Any, ...]] = {
     "law": tuple(MODELS.values()),
 }
 
-ODD = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=80), st.just("file"),
-    st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=4), st.none()), max_size=4),
-    st.lists(st.lists(st.floats(), max_size=3), max_size=3),
-    st.dictionaries(st.text(max_size=8), st.integers(), max_size=2),
-)  # fmt: skip
-
 
 def kind_with(section: str, name: str) -> str | None:
     """The first kind of reference or law that has a key; None where kinds do not matter."""
     return next(
         (kind.model_fields["kind"].default for kind in KINDS.get(section, ()) if name in kind.model_fields), None
     )
-
-
-@settings(max_examples=120, deadline=None)
-@given(st.sampled_from(list(KEYS)), ODD)
-def test_a_refusal_is_one_line_that_names_the_key_whatever_is_set(key: str, value: Any) -> None:
-    tree: dict[str, Any] = Settings().description()
-    branch = tree
-    *sections, name = key.split(".")
-    for section in sections:
-        branch = branch[section]
-    if sections and (kind := kind_with(sections[0], name)):
-        branch["kind"] = kind
-    branch[name] = value
-    try:
-        from_description(tree)
-    except ConfigError as error:
-        (line,) = str(error).splitlines()
-        assert (sections[0] if sections else name) in line
 
 
 def test_every_key_is_described_and_a_quantity_has_a_unit() -> None:
@@ -145,22 +120,19 @@ def test_a_variable_that_is_no_setting_is_refused(variable: str, hint: str, monk
         load()
 
 
-def test_a_description_is_read_without_the_readers_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    old = load().description()
-    del old["loop"]["rate_hz"]
-    monkeypatch.setenv("AEROLOOP_LOOP__RATE_HZ", "100")
-    monkeypatch.setenv("AEROLOOP_LOP", "1")
-    assert from_description(old).loop.rate_hz == 500
-
-
-def test_a_description_is_read_without_keys_that_this_version_does_not_have_and_with_those_of_a_user() -> None:
+def test_a_description_is_read_without_the_environment_and_keys_of_other_versions_but_with_a_users_keys(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     settings = load(overrides=["law.kind=my:Law", "law.k=3", "can.options={a = 1}", "plant.kind=my:P", "plant.own.b=2"])
     old = settings.description()
     for section in (old, old["loop"], old["network"]["security"], old["reference"], old["wire"]["rate"]):
         section["gone"] = 1
+    del old["loop"]["rate_hz"]
+    monkeypatch.setenv("AEROLOOP_LOOP__RATE_HZ", "100")
+    monkeypatch.setenv("AEROLOOP_LOP", "1")
     assert from_description(old) == settings
     old["law"] = {"kind": "pd", "gone": 1}
-    assert from_description(old).law == load(overrides=["law.kind=pd"]).law
+    assert from_description(old).law.kind == "pd"
 
 
 OVERRIDES: tuple[tuple[str, ...], ...] = (
@@ -225,7 +197,7 @@ def test_points_of_a_csv_file_are_the_reference_and_stand_in_the_description(tmp
         load(toml)
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(chance=st.randoms(use_true_random=False))
 def test_a_mutated_configuration_is_loaded_or_refused_in_one_line(
     chance: Random, tmp_path_factory: pytest.TempPathFactory

@@ -60,16 +60,6 @@ def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) ->
     assert not diagnosis.findings[-1].good
 
 
-def test_cpus_that_sleep_are_no_reason_for_a_service_which_may_not_keep_them_awake_either(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    lines = ["SCHED_FIFO 10: Operation not permitted (raise LimitRTPRIO)", "idle CPUs sleep: /dev/x: Permission denied"]
-    monkeypatch.setattr(doctor, "prepare_process", lambda _settings: lines)
-    monkeypatch.setattr(doctor, "CHECK_S", 0.1)
-    advice = [finding.advice for finding in doctor.diagnose(LoopSettings()).findings if finding.what == "set-up"]
-    assert ["service" in each for each in advice] == [True, False]
-
-
 def test_with_certificates_it_says_which_is_refused_where(tmp_path: Path) -> None:
     ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
     for authority in (ours, foreign):

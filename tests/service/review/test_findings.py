@@ -16,10 +16,9 @@ from aeroloop.protocol.messages.models import Event, Loss
 from aeroloop.protocol.messages.trace import Outcome, Received, read_batch, read_header
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.review.report import Check, Findings, Spread
+from aeroloop.service.review.report import Check, Findings
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import read
-from aeroloop.service.terminal.log_sheets import sparkline
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, lockstep, make_log
@@ -233,13 +232,6 @@ def test_what_is_no_limit_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(LimitError) as refused:
         Limit.parse(text)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:
-    bins = [(1000.0, 500_000), (1044.0, 500_000), (64_000.0, 1)]
-    bars = sparkline(Spread(count=1_000_001, p50=1000, p90=1000, p99=1000, p999=1000, max=64_000, bins=bins), width=12)
-    assert bars == "█          ▁"
-    assert sparkline(Spread(count=1, p50=9, p90=9, p99=9, p999=9, max=9, bins=[(9.0, 1)])) == "█"
 
 
 def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(

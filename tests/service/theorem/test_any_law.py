@@ -71,7 +71,7 @@ def test_a_law_that_brings_a_certificate_has_its_own(
         ("sliding", "no theorem for this law, sliding"),
         (
             f"{HERE}:Boastful",
-            f"the certificate of law {HERE}:Boastful is none: verdict: is missing",
+            f"the certificate of law {HERE}:Boastful is none: verdict: Field required",
         ),
         (f"{HERE}:Careless", f"no certificate: law {HERE}:Careless: KeyError: 'decay' (test_any_law.py, line "),
     ],
