@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -109,20 +107,13 @@ def with_bits_of(settings: Settings, bits: str | None) -> Settings:
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code; ^C is a KeyboardInterrupt."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as in a background job
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Turn expected errors into one line and an exit code."""
     try:
         yield
     except (AeroloopError, ValueError) as error:
         if state["debug"]:
             raise
         fail(str(error).splitlines()[0], 1)
-    except KeyboardInterrupt:
-        raise typer.Exit(INTERRUPTED) from None
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -29,9 +29,7 @@ group.add_typer(
 
 @group.command()
 def doctor(
-    network: Annotated[
-        bool, typer.Option("--network", help="Try this host's certificates at every endpoint, too.")
-    ] = False,
+    network: Annotated[bool, typer.Option("--network", help="Shake hands with each configured place, too.")] = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,

@@ -21,8 +21,9 @@ from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
 from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
-from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
-from aeroloop.protocol.transport.probe import PLAIN_S, refusal
+from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.network_settings import NetworkSettings, opened
+from aeroloop.protocol.transport.probe import PLAIN_S, accepting, refusal
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host.health import LATE_SHARE
 
@@ -70,7 +71,11 @@ def diagnose(
     Raises:
         NetworkError, CertificateError: The network's links cannot be secured.
     """
-    findings = [*_settings(), *(certificate_findings(keys) if keys else ()), *(refused(network) if network else ())]
+    findings = [
+        *_settings(),
+        *(certificate_findings(keys) if keys else ()),
+        *(network_findings(network) if network else ()),
+    ]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     awake = "let the user write to it, or use tuned's profile latency-performance"
     findings += [
@@ -118,31 +123,30 @@ def certificate_findings(directory: Path) -> Iterator[Finding]:
         )
 
 
-def refused(network: NetworkSettings) -> list[Finding]:
-    """Try each usable certificate of this host at every endpoint of the network, all at once: where it is refused.
+def network_findings(network: NetworkSettings) -> Iterator[Finding]:
+    """A handshake with each configured place, by each usable certificate of this host; of several ports, all.
 
     Raises:
         NetworkError, CertificateError: The network's links cannot be secured.
     """
     from aeroloop.service.host.keys import show
 
-    directory = network.security.folder
-    if directory is None:
-        return [Finding("network", True, "no certificates, so none is refused")]
-    found = [read_certificate(directory / row.file) for row in show(directory)[1:] if row.problem is None]
-    tries = [
-        (place, certificate)
-        for certificate in found
-        for settings in [protected(network, Identity((certificate.role,), certificate.vehicle)).settings]
-        for place in [*settings.rendezvous_endpoints, *settings.connect]
-    ]
-    with ThreadPoolExecutor(max(1, len(tries))) as pool:
-        lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))
-    return [
-        Finding(each.file.name, False, f"refused at {place}", line)
-        for (place, each), line in zip(tries, lines, strict=True)
-        if line
-    ] or [Finding("network", True, f"none of {len(found)} certificates is refused")]
+    folder = network.security.folder
+    rows = show(folder)[1:] if folder else []
+    usable = [read_certificate(folder / row.file) for row in rows if folder and row.problem is None]
+    for text in [*network.rendezvous, *network.connect]:
+        place, several = opened(text, network), network.mode == "peer" and text in network.rendezvous
+        answering = accepting([str(each) for each in Endpoint.parse(place).ports(network.ports if several else 1)])
+        tries = [(port, certificate) for port in answering for certificate in usable]
+        with ThreadPoolExecutor(max(1, len(tries))) as pool:
+            lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))
+        refused = [(port, each.file.name, line) for (port, each), line in zip(tries, lines, strict=True) if line]
+        for port, name, line in refused:
+            yield Finding(name, False, f"refused at {port}", line)
+        if not answering:
+            yield Finding(place, False, "no process answers", "start one there, and let TCP through to it")
+        elif not refused:
+            yield Finding(place, True, f"answers, and refuses none of {len(usable)} certificates" if usable else "answers")
 
 
 def _settings() -> Iterator[Finding]:

@@ -60,7 +60,9 @@ def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) ->
     assert not diagnosis.findings[-1].good
 
 
-def test_with_certificates_it_says_which_is_refused_where(tmp_path: Path) -> None:
+def test_it_says_of_each_configured_place_whether_a_process_answers_and_which_certificate_is_refused(
+    tmp_path: Path,
+) -> None:
     ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
     for authority in (ours, foreign):
         authority.issue("operator")
@@ -72,11 +74,11 @@ def test_with_certificates_it_says_which_is_refused_where(tmp_path: Path) -> Non
         return settings.model_copy(update={"security": security})
 
     with join(of(ours), Identity(("plant",), "aero")):
-        (fine,) = doctor.refused(of(ours))
-        assert fine.good
-        assert fine.found == "none of 2 certificates is refused"
-        findings = doctor.refused(of(foreign))
+        (fine,) = doctor.network_findings(of(ours))
+        assert (fine.good, fine.found) == (True, "answers, and refuses none of 2 certificates")
+        findings = list(doctor.network_findings(of(foreign)))
     assert [finding.what for finding in findings] == ["operator.pem", "plant.aero.pem"]
     assert all("refused at tls/" in finding.found for finding in findings)
     assert all("not of this authority" in finding.advice for finding in findings)
-    assert [finding.good for finding in doctor.refused(settings)] == [True]
+    (silent,) = doctor.network_findings(of(ours))
+    assert (silent.good, silent.found) == (False, "no process answers")
