@@ -146,7 +146,9 @@ def network_findings(network: NetworkSettings) -> Iterator[Finding]:
         if not answering:
             yield Finding(place, False, "no process answers", "start one there, and let TCP through to it")
         elif not refused:
-            yield Finding(place, True, f"answers, and refuses none of {len(usable)} certificates" if usable else "answers")
+            yield Finding(
+                place, True, "answers" + (f", and refuses none of {len(usable)} certificates" if usable else "")
+            )
 
 
 def _settings() -> Iterator[Finding]:

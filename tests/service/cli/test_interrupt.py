@@ -120,18 +120,15 @@ def wait_until_none_is_left(process: subprocess.Popen[str]) -> None:
         time.sleep(0.01)
 
 
-def test_worker_processes_end_in_silence() -> None:
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+def test_worker_processes_end_with_their_parent_in_silence(sent: int) -> None:
+    """^C reaches the whole group; SIGKILL the parent alone."""
     process = start(*COMMAND, "lab", "tables")
     wait_for_workers(process)
-    os.killpg(process.pid, signal.SIGINT)
+    if sent == signal.SIGINT:
+        os.killpg(process.pid, sent)
+    else:
+        process.send_signal(sent)
     _, printed = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, printed) == (130, "")
-    wait_until_none_is_left(process)
-
-
-def test_workers_end_with_a_parent_that_is_killed() -> None:
-    process = start(*COMMAND, "lab", "tables")
-    wait_for_workers(process)
-    process.kill()
-    process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, printed) == (130 if sent == signal.SIGINT else -sent, "")
     wait_until_none_is_left(process)

@@ -105,7 +105,7 @@ def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
     assert out.index("duration") < out.index("before plant tripped trip of s1")
     assert "session s2 of aero" in out
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
-    assert "sessions 1 s1, 0.4 s 2 s2, 0.2 s, shown --session N shows another of 2" in out
+    assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
     assert "session s2" in page.read_text()
     assert export([log], "csv", tmp_path / "b.csv", vehicle=OTHER).sessions == ["beta/b1"]
     assert export([log], "csv", tmp_path / "all.csv", session="all").sessions == ["aero/s1", "aero/s2"]

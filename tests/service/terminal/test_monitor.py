@@ -100,10 +100,3 @@ def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
     for words in ("12345/67890", "1234567", "99 d", "tripped"):
         assert words in shown
     assert cause in " ".join(shown.split())
-
-
-def test_what_is_not_understood_is_left_out() -> None:
-    view = driven()
-    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "else"):
-        view.top.receive(key, b'{"not": "a message"}')
-    assert "+12.5" in view.text()
