@@ -6,8 +6,6 @@ daemons; it shows the machine's part of the jitter, to which Zenoh adds its own.
 
 from __future__ import annotations
 
-import os
-import resource
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -77,10 +75,12 @@ def diagnose(
         *(network_findings(network) if network else ()),
     ]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
-    awake = "let the user write to it, or use tuned's profile latency-performance"
-    findings += [
-        Finding("set-up", False, line, awake if "CPUs sleep" in line else "run it as a service") for line in refusals
-    ]
+    if not refusals:
+        findings.append(Finding("real-time set-up", True, "SCHED_FIFO, locked memory, awake CPUs"))
+    for line in refusals:
+        awake = "let the user write to it, or use tuned's profile latency-performance"
+        limits = "run it as a unit of `aeroloop host units`, or raise the user's limit in /etc/security/limits.d"
+        findings.append(Finding("real-time set-up", False, line, awake if "CPUs sleep" in line else limits))
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
     ticks, report_every = loop.ticks(CHECK_S), max(1, loop.ticks(0.2))
     while grid.tick < ticks:
@@ -152,24 +152,13 @@ def network_findings(network: NetworkSettings) -> Iterator[Finding]:
 
 
 def _settings() -> Iterator[Finding]:
-    """The kernel's settings and this process's limits."""
-    root = os.geteuid() == 0
-    priority, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    memory, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    """The kernel's settings, as far as the trial's own set-up does not show them."""
     clock, governor = map(host_facts().get, ("clock", "governor"))
     yield Finding(
         "clock source",
         clock in GOOD_CLOCKS,
         clock or "not reported by this kernel",
         "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
-    )
-    rights = "give the user {0} (systemd), or '{1}' in /etc/security/limits.d"
-    allowed = "root may" if root else f"limit {priority}"
-    yield Finding("real-time priority", root or priority != 0, allowed, rights.format("LimitRTPRIO=10", "rtprio 10"))
-    unlimited = memory == resource.RLIM_INFINITY
-    allowed = "root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB"
-    yield Finding(
-        "locked memory", root or unlimited, allowed, rights.format("LimitMEMLOCK=infinity", "memlock unlimited")
     )
     yield Finding(
         "CPU frequency",

@@ -98,7 +98,6 @@ def issue(directory: Path, role: str, name: str, vehicle: str | None = None) -> 
         CertificateError: Role, name or vehicle will not do; a file exists; the authority's key is not here.
     """
     subject, file = _subject(role, name, vehicle), file_of(directory, role, vehicle)
-    _refuse_existing(file, file.with_suffix(".key"))
     secret, authority = _read_key(directory / KEY), load(directory / AUTHORITY)
     if authority.public_key() != secret.public_key():
         raise CertificateError(f"{directory / KEY} is not the key of {AUTHORITY} beside it")
@@ -205,15 +204,11 @@ def _read_key(file: Path) -> EllipticCurvePrivateKey:
         raise CertificateError(f"{file} is no private key in PEM without a password") from None
 
 
-def _refuse_existing(*files: Path) -> None:
-    for file in files:
-        if os.path.lexists(file):
-            raise CertificateError(f"{file} exists, and is not overwritten: move it away first")
-
-
 def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticCurvePrivateKey) -> Path:
     """Write a certificate and its key as new files, of their mode from the first byte on."""
-    _refuse_existing(file, secret)
+    for path in (file, secret):
+        if os.path.lexists(path):
+            raise CertificateError(f"{path} exists, and is not overwritten: move it away first")
     contents = {
         secret: (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600),
         file: (made.public_bytes(Encoding.PEM), 0o644),

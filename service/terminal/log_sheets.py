@@ -127,9 +127,6 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
             yield f"invalid {name}s", str(n)
     if findings.lapses:
         yield "irregular ticks", ", ".join(f"{n} {name}" for name, n in findings.lapses.items())
-    if findings.clock_offset_us is not None:
-        first, last = findings.clock_offset_us
-        yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
     for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
