@@ -99,7 +99,12 @@ def test_file_environment_and_set_replace_each_other_in_this_order(
     monkeypatch.setenv("AEROLOOP_VEHICLE", "environment")
     monkeypatch.setenv("AEROLOOP_LOOP__LOCKSTEP", "true")
     monkeypatch.setenv("AEROLOOP_CAN__OPTIONS__BITRATE", "7")
+    monkeypatch.setenv("AEROLOOP_LAW__KIND", "my:Law")
+    monkeypatch.setenv("AEROLOOP_LAW__K", "[1, 2]")
+    monkeypatch.setenv("AEROLOOP_NETWORK__RENDEZVOUS", "tcp/127.0.0.1:7999")
     loaded = load(path)
+    assert loaded.law.model_extra == {"k": [1, 2]}
+    assert loaded.network.rendezvous == ["tcp/127.0.0.1:7999"]
     assert (loaded.vehicle, loaded.loop.rate_hz, loaded.loop.lockstep) == ("environment", 100.0, True)
     assert loaded.can.options == {"bitrate": 7}
     assert load(path, ["vehicle=option"]).vehicle == "option"

@@ -36,13 +36,6 @@ def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> 
         load_target(None, [given])
 
 
-@pytest.mark.parametrize("variable", ["AEROLOOP_NETWORK__PROTS", "AEROLOOP_LOP__RATE_HZ"])
-def test_a_wrong_variable_is_refused(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(variable, "1")
-    with pytest.raises(ConfigError, match=f"^{variable} in the environment is no setting"):
-        load_target()
-
-
 def test_every_plant_is_stopped_unless_a_vehicle_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped: list[str | None] = []
 
