@@ -73,8 +73,12 @@ def shown(hil: Hil, *, last: bool = False) -> SessionRecord:
     """What the controller follows; with `last` the plant's record of the session that ended."""
     with command_session(hil.settings.network) as here:
         here.wait_for_links()
-        key, request = topics.key("show", "aero"), Request().encode()
-        replies = here.session.get(key, payload=request, timeout=1.0, consolidation=zenoh.ConsolidationMode.NONE)
+        replies = here.session.get(
+            topics.key("show", "aero"),
+            payload=Request().encode(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
         payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
     records = [SessionRecord.model_validate_json(each) for each in payloads if b'"controller"' in each]
     return next(record for record in records if (record.ended is not None) == last)
