@@ -106,17 +106,6 @@ def with_bits_of(settings: Settings, bits: str | None) -> Settings:
 
 
 @contextmanager
-def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code."""
-    try:
-        yield
-    except (AeroloopError, ValueError) as error:
-        if state["debug"]:
-            raise
-        fail(str(error).splitlines()[0], 1)
-
-
-@contextmanager
 def checked(*models: type[BaseModel]) -> Iterator[None]:
     """Build values of these models from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
@@ -133,10 +122,10 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 
 @contextmanager
 def working(title: str, json: bool, total: float | None = None) -> Iterator[Callable[..., None]]:
-    """As `guarded`, with a progress bar: `update(done, total)`. No bar where JSON is printed."""
+    """A progress bar: `update(done, total)`. No bar where JSON is printed."""
     from aeroloop.service.terminal.display import progress_bar
 
-    with guarded(), progress_bar(title, total, hidden=json) as update:
+    with progress_bar(title, total, hidden=json) as update:
         yield update
 
 
@@ -173,5 +162,5 @@ def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
     """A path to write to, once the table is printed: a full disk must not cost the table."""
     from aeroloop.service.logs.outputs import writing
 
-    with guarded(), writing(path, [config], force=force) as part:
+    with writing(path, [config], force=force) as part:
         yield part

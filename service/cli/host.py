@@ -11,7 +11,6 @@ from aeroloop.service.cli.common import (
     Config,
     Json,
     Overrides,
-    guarded,
     settings_of,
     show,
     working,
@@ -65,9 +64,8 @@ def units(
         for name in units.units_of(source.settings):
             typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
     else:
-        with guarded():
-            for path in units.install(install, source):
-                typer.echo(path)
+        for path in units.install(install, source):
+            typer.echo(path)
     typer.echo("# next:")
     for step in units.next_steps(install, source):
         typer.echo(f"#   {step}" if install is None else step)
@@ -79,8 +77,7 @@ def init(directory: Directory = DIRECTORY) -> None:
     from aeroloop.service.host import keys
 
     folder = directory.expanduser().absolute()
-    with guarded():
-        typer.echo(keys.init(folder))
+    typer.echo(keys.init(folder))
     typer.echo(
         f"next: `aeroloop host keys issue ROLE NAME`, and in every configuration [network.security] directory = "
         f'"{folder}"',
@@ -100,8 +97,7 @@ def issue(
     """Issue a certificate with a new key, for 90 days."""
     from aeroloop.service.host import keys
 
-    with guarded():
-        typer.echo(keys.issue(directory.expanduser().absolute(), role, name, vehicle))
+    typer.echo(keys.issue(directory.expanduser().absolute(), role, name, vehicle))
 
 
 @keys.command("show")
@@ -110,8 +106,7 @@ def show_keys(json: Json = False, directory: Directory = DIRECTORY) -> None:
     from aeroloop.service.host import keys
 
     folder = directory.expanduser().absolute()
-    with guarded():
-        files = keys.show(folder)
+    files = keys.show(folder)
     if json:
         from json import dumps
 

@@ -21,7 +21,6 @@ from aeroloop.service.cli.common import (
     check_engine,
     check_figure,
     checked,
-    guarded,
     loop_of,
     new_file,
     show,
@@ -130,8 +129,7 @@ def certify(
     from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.theorem.certificate import certificate_of
 
-    with guarded():
-        result = certificate_of(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+    result = certificate_of(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

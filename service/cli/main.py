@@ -12,6 +12,7 @@ from typing import Annotated, Final
 import typer
 from typer.exceptions import TyperException
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import report, state
 from aeroloop.service.cli.entry import INTERRUPTED
@@ -60,7 +61,9 @@ def execute(arguments: Sequence[str]) -> int:
     except Exception as error:
         if state["debug"]:
             raise
-        if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
+        if isinstance(error, AeroloopError | ValueError):
+            report(str(error).splitlines()[0])
+        elif isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
             report(f"this needs {error.name}, which is not installed: pip install 'aeroloop[{extra}]'")
         else:
             text = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, target_of
+from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, target_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,8 +50,7 @@ def status(
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
-    with guarded():
-        found = gather(target.network)
+    found = gather(target.network)
     if "vehicle" in target.model_fields_set:
         if target.vehicle not in found.statuses:
             fail(f"no role of {target.vehicle} answers, only of {', '.join(sorted(found.statuses))}", 1)
@@ -84,9 +83,8 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
     target = target_of(config, overrides)
     from aeroloop.service.terminal.monitor import watch
 
-    with guarded():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
-        watch(target.network)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
+    watch(target.network)
 
 
 @group.command()
@@ -105,9 +103,8 @@ def stop(
     target = target_of(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
-    with guarded():
-        configured = "vehicle" in target.model_fields_set
-        answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
+    configured = "vehicle" in target.model_fields_set
+    answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
     for line in answers:
         typer.echo(line)
     if failures:
@@ -238,8 +235,7 @@ def _send(target: Target, topic: str, message: Message | None = None) -> None:
     from aeroloop.protocol.messages.operator import Request
     from aeroloop.service.host.operator import send
 
-    with guarded():
-        typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
+    typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
 
 
 def _vehicle(target: Target) -> str:

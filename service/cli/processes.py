@@ -8,7 +8,6 @@ import signal
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from aeroloop.service.cli.common import guarded
 from aeroloop.service.cli.entry import end_unstarted
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None
     if (refused := no_linger()) is not None:
         logging.getLogger("aeroloop").warning("%s", refused)
     name = controller_name() if kind == "controller" else None
-    with guarded(), Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
+    with Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
         begun.set()
         run(role)
 
@@ -39,8 +38,7 @@ def run_alone(run: Callable[[Event], None]) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
     begun, stop = _stop_on_signals()
     begun.set()
-    with guarded():
-        run(stop)
+    run(stop)
 
 
 def _stop_on_signals() -> tuple[Event, Event]:
