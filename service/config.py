@@ -26,8 +26,7 @@ from aeroloop.service.config_sources import Sources, Target, merged, read, tree_
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import CustomLawSettings, LawSection, law_settings
-from aeroloop.service.points_file import PointsError, read_points
-from aeroloop.service.settings import ControllerSettings, RecorderSettings
+from aeroloop.service.settings import ControllerSettings, PointsError, RecorderSettings, read_points
 
 
 class PointsFile(BaseModel, extra="forbid"):

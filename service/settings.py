@@ -1,11 +1,19 @@
-"""Settings of the controller daemon and of the recorder. Light to import, because every command reads them."""
+"""Settings of the controller daemon and of the recorder, and a reference from a file.
+
+Light to import, because every command reads them.
+"""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationError
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Points
+from aeroloop.protocol.wording import problems
 
 
 class ControllerSettings(BaseModel, extra="forbid"):
@@ -18,37 +26,17 @@ class ControllerSettings(BaseModel, extra="forbid"):
     auto_arm: bool = Field(
         default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
     )
-    telemetry_rate_hz: float = Field(default=10.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     max_reference_rate: float = Field(
         default=1.0, gt=0, le=100, description="largest angular velocity of an operator's reference [rad/s]"
     )
-    max_reference_braking: float = Field(
-        default=1.0,  # the Aero's motors turn it by 2.4 rad/s² in pitch at 24 V
-        ge=0.01,
-        le=100,
-        description="largest acceleration with which roll, pitch and yaw each brake before an operator's motion and "
-        "run up to a reference that moves; from the rate v an axis stops within 0.75 v² / this [rad/s²]",
-    )
     max_reference_tilt_deg: float = Field(
         default=60.0, gt=0, le=180, description="largest tilt of an operator's reference [deg]"
-    )
-    start_within_deg: float = Field(
-        default=20.0,
-        ge=0,
-        le=360,
-        description="a session that begins further than this from its reference first approaches it smoothly [deg]",
     )
     after_restart: Literal["hold", "resume", "configured"] = Field(
         default="hold",
         description="what a session begins with. hold: the attitude found, until `op goto` or `op track`; resume: the "
         "gains of the vehicle's last session and, unless an operator stopped it, its reference; configured: those of "
         "the configuration, and after a trip those of the session before",
-    )
-    law_timeout_s: float = Field(
-        default=0.1,
-        gt=0,
-        le=10,
-        description="stop commanding, as faulted, after a tick of the law that takes longer; not in lockstep [s]",
     )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is on the network")
 
@@ -74,3 +62,44 @@ class RecorderSettings(BaseModel, extra="forbid"):
         gt=0,
         description="remove the recorder's oldest logs when all together are larger than this; none if left out [GB]",
     )
+
+
+class PointsError(AeroloopError):
+    """The file cannot be read, or is no table of points; one line with the path."""
+
+
+def read_points(path: Path) -> Points:
+    """Attitudes over time from a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
+
+    Raises:
+        PointsError: It cannot be read, or is no such table; names the line of a row that is not four numbers.
+    """
+    table: list[list[float]] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file)
+            for i, cells in enumerate(rows):
+                if not cells or (i == 0 and _numbers(cells[:1]) is None):  # a heading
+                    continue
+                numbers = _numbers(cells)
+                if numbers is None or len(numbers) != 4:
+                    raise PointsError(
+                        f"{path}, line {rows.line_num}: expected four numbers (time [s], roll, pitch, yaw [deg]), not "
+                        f"{','.join(cells)!r}"
+                    )
+                table.append(numbers)
+    except UnicodeDecodeError:
+        raise PointsError(f"cannot read {path}: it is not text") from None
+    except (OSError, csv.Error) as error:
+        raise PointsError(f"cannot read {path}: {getattr(error, 'strerror', error)}") from None
+    try:
+        return Points.model_validate({"times": [row[0] for row in table], "attitudes": [row[1:] for row in table]})
+    except ValidationError as error:
+        raise PointsError(f"{path}: {'; '.join(problems(error, Points))}") from None
+
+
+def _numbers(cells: list[str]) -> list[float] | None:
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError:
+        return None

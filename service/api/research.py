@@ -94,7 +94,7 @@ def certify(
     Args:
         settings: The configuration; the defaults if None.
         disturbance: Largest ‖τ_d‖ beyond what the plant's settings say [N·m]; a machine needs it.
-        attitude_error_deg: Assumed bound of the attitude error [deg]; `controller.start_within_deg` if None.
+        attitude_error_deg: Assumed bound of the attitude error [deg]; 20 if None, within which sessions begin.
     """
     return certificate.certify(
         settings or load_settings(), disturbance=disturbance, attitude_error_deg=attitude_error_deg

@@ -114,8 +114,7 @@ def certify(
             metavar="DEG",
             min=0,
             max=180,
-            help="Assumed bound of the attitude error, in degrees; controller.start_within_deg if left out; 180 "
-            "assumes nothing.",
+            help="Assumed bound of the attitude error, in degrees; 20 if left out; 180 assumes nothing.",
         ),
     ] = None,
     bits: BitsOption = None,

@@ -210,7 +210,7 @@ def track(
 ) -> None:
     """Follow another reference: a sinusoid, a file, set-points. `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
-    from aeroloop.service.points_file import read_points
+    from aeroloop.service.settings import read_points
 
     target = target_of(config, overrides)
     options = {name: each for name, each in (("amplitude", amplitude), ("frequency", frequency)) if each is not None}

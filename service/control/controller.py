@@ -1,8 +1,8 @@
 """Controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
 
-It uses no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
-run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
-sent; the controller then receives UNCHANGED and computes with the levels it holds.
+Daemon, lockstep experiment, review of a log and tests all run this one code path. The law's time is k times the
+period. A frame that would repeat the last levels need not be sent; the controller then receives UNCHANGED and computes
+with the levels it holds.
 
 Between the codes of the one frame and those of the other stands one CasADi function, `tick_function`. Its outputs are
 one row of doubles. After a valid tick the row is copied; the copy is what the next tick continues from.
@@ -39,38 +39,32 @@ from aeroloop.service.control.reference import reference_function
 
 Codes = tuple[float, ...]
 
-OF_MEASUREMENT: Final = ("q", "state_next", "q_d", "omega", "eps_e", "omega_e")
+_OF_MEASUREMENT: Final = ("q", "state_next", "q_d", "omega", "eps_e", "omega_e")
 """Outputs that are kept of every measurement with valid values; the others only if u is a number."""
 
 # ── one tick as one function ──
 
 
 def tick_function(wire: WireSpec, law: Law[Any]) -> ca.Function:
-    """One tick: codes of a measurement in, codes of the command out.
+    """One tick: codes of a measurement in, codes of the command out. Raises LawError as `law_function`.
 
     The parts are inserted as they are written, so every bit is that of the parts evaluated one after the other.
 
     Inputs:
         codes: Of the measurement. Shape (6,).
         t, start, quintic, amplitude, frequency: Time, and the reference's piece, as for `reference_function`.
-        gains: The law's gains, one below the other.
-        last, state: q and the law's state after the last measurement.
+        gains, last, state: As for `law_function`; of a law in Python also law_voltages and law_state.
         held: Codes of the last valid command; NaN before the first. Shape (actuators,).
         saturated: Voltages beyond the range so far.
-        law_voltages, law_state: Of a law in Python only: what it has computed in this tick.
 
     Outputs:
         q, state_next: State for the next tick.
         q_d, omega, eps_e, omega_e: Desired attitude, rate as received, errors.
-        u: Command before quantization [V]. Shape (actuators,).
-        command: Its codes. Shape (actuators,).
+        u, command: Voltages before quantization [V], and their codes. Shapes (actuators,).
         saturated_next: The count for the next tick.
         measured: 1 if each code of the measurement has a level. If 0, no output above counts.
         computed: 1 if u is a number, too. If 0, u, command and saturated_next do not count.
         eta_e, omega_d, omega_d_dot: The rest of what a law in Python computes from.
-
-    Raises:
-        LawError: The law fails, or does not fit so many actuators.
     """
     laws = law_function(law)
     reference = reference_function()
@@ -118,6 +112,11 @@ def _expressions_function(wire: WireSpec, law: type[ExpressionLaw[Any]], setting
 # ── the controller ──
 
 
+def _last(name: str) -> Any:
+    """A property of the controller: an output at the last valid tick."""
+    return property(lambda self: tuple(self.last_valid[name]))
+
+
 class ControllerSnapshot(BaseModel):
     """State carried from tick to tick, besides reference and gains. Its JSON keeps every bit of the floats.
 
@@ -125,10 +124,8 @@ class ControllerSnapshot(BaseModel):
         attitude: q^Q of the last measurement [1].
         law: The law's named state.
         held: Codes of the last measurement, for silence; None before the first. Shape (6,).
-        voltage_codes: Codes of the last valid voltages, for quantizers with a memory; None before the first.
-            Shape (actuators,).
-        sent_codes: Codes of the last command sent; None where commands are periodic, before the first, and where the
-            next command is sent in any case. Shape (actuators,).
+        voltage_codes: Those of the last valid voltages, for quantizers with a memory; None before the first.
+        sent_codes: Those of the last command sent; None where the next one is sent in any case.
         sent_tick: Its tick.
     """
 
@@ -148,12 +145,10 @@ class Controller:
     It follows the reference from tick 0 on; `period` is the time between ticks [s].
 
     Attributes:
-        tick_index: k of the last measurement answered; −1 before the first.
-        counter: Its counter.
+        tick_index: k of the last measurement answered, −1 before the first; `counter` is that measurement's.
         motion: The reference as followed; may be changed between two ticks.
-        refused: Malformed measurement frames so far.
+        refused: Malformed measurement frames so far; `invalid`, those with the code "no valid value".
         fault: Why the law gave no voltages, once it has not; None before.
-        invalid: Measurements with the code "no valid value" so far.
         outputs: What the last tick computed, by name as of `tick_function`; `row` has them one beside the other.
         last_valid: The same of the last valid tick.
 
@@ -162,13 +157,23 @@ class Controller:
         PluginError: There is no such law.
     """
 
+    attitude: Quaternion = _last("q")
+    """q^Q of the last measurement [1]."""
+    rate: Vector = _last("omega")
+    """ω^Q of the last measurement, body frame [rad/s]."""
+    desired: Quaternion = _last("q_d")
+    """q_d at the last measurement [1]."""
+    attitude_error: Vector = _last("eps_e")
+    """ε̃ at the last measurement [1]."""
+    rate_error: Vector = _last("omega_e")
+    """ω_e at the last measurement, body frame [rad/s]."""
+    voltages: tuple[float, ...] = _last("u")
+    """The last u before quantization [V]. Shape (actuators,)."""
+
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
         self.wire = wire
         self.period = period
-        self.tick_index = -1
-        self.counter = 0
-        self.refused = 0
-        self.invalid = 0
+        self.tick_index, self.counter, self.refused, self.invalid = -1, 0, 0, 0
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)
         gains, state = configured_gains(self.law), initial_state(self.law)
@@ -205,17 +210,11 @@ class Controller:
         self.restore(ControllerSnapshot(law={name: tuple(values) for name, values in state.items()}))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Answer a measurement.
-
-        Args:
-            frame: The newest measurement frame; UNCHANGED if the plant sent none because its levels have not changed;
-                None if none was received since the last tick.
-            k: Tick index; the law's time is k·period.
+        """Answer the measurement of tick k: a frame, UNCHANGED if its levels have not changed, or None for none.
 
         Returns:
-            The command frame; UNCHANGED if it would repeat the last one; None if there is nothing to
-            answer, which includes malformed bytes. A measurement without a valid value is answered by a command without
-            one: the plant then goes to 0 V.
+            The command frame; UNCHANGED if it would repeat the last one; None for no measurement and malformed bytes.
+            A measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
         """
         if frame is None:
             return None
@@ -242,14 +241,14 @@ class Controller:
             command = [*map(self._as_codes, self.outputs["command"])]
         elif self._measured[0]:
             self.fault = self.fault or f"law {self.law.settings.kind} gave no number"
-            for name in OF_MEASUREMENT:
+            for name in _OF_MEASUREMENT:
                 self.last_valid[name][:] = self.outputs[name]
         else:
             self.invalid += 1
         return self._write(counter, command) if self._sender.due(k, command) else UNCHANGED
 
     def _step_python(self) -> None:
-        """Compute voltages and next state of a law in Python, from what the function has found so far."""
+        """Compute voltages and next state of a law in Python, from what the function has computed so far."""
         law, seen, inputs = self.law, self.outputs, self._function.inputs
         assert isinstance(law, PythonLaw)
         _write_to(inputs["law_voltages"], [nan] * self.wire.actuators)
@@ -351,36 +350,6 @@ class Controller:
     def law_state(self) -> dict[str, tuple[float, ...]]:
         """The law's named state after the last measurement."""
         return {name: tuple(part) for name, part in self._state.items()}
-
-    @property
-    def attitude(self) -> Quaternion:
-        """q^Q of the last measurement [1]."""
-        return tuple(self.last_valid["q"])  # type: ignore[return-value]  # four elements
-
-    @property
-    def rate(self) -> Vector:
-        """ω^Q of the last measurement, body frame [rad/s]."""
-        return tuple(self.last_valid["omega"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def attitude_error(self) -> Vector:
-        """ε̃ at the last measurement [1]."""
-        return tuple(self.last_valid["eps_e"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def rate_error(self) -> Vector:
-        """ω_e at the last measurement, body frame [rad/s]."""
-        return tuple(self.last_valid["omega_e"])  # type: ignore[return-value]  # three elements
-
-    @property
-    def desired(self) -> Quaternion:
-        """q_d at the last measurement [1]."""
-        return tuple(self.last_valid["q_d"])  # type: ignore[return-value]  # four elements
-
-    @property
-    def voltages(self) -> list[float]:
-        """The last u before quantization [V]. Shape (actuators,)."""
-        return list(self.last_valid["u"])
 
     @property
     def saturated(self) -> int:

@@ -12,7 +12,7 @@ A set-point of a stream is reached by a single quintic, which need not stop, whe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import ceil, degrees, floor, inf, isfinite, log10
+from math import ceil, degrees, inf, isfinite
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,6 +30,12 @@ from aeroloop.service.control.reference import (
     reference_function,
 )
 
+BRAKING: Final = 1.0
+"""Largest acceleration with which roll, pitch and yaw each brake before a motion and run up to a reference that moves
+[rad/s²]; from the rate v an axis stops within 0.75 v². The Aero's motors turn it by 2.4 rad/s² in pitch at 24 V."""
+START_WITHIN_DEG: Final = 20.0
+"""A session that begins further than this from its reference first approaches it smoothly [deg]; from nearer the law
+gets there before a motor has been at its limit for the second after which the Aero trips."""
 LEAST_TURN_S: Final = 0.02
 """Least time of the turn [s], however small it is."""
 LET_GO_S: Final = 0.1
@@ -65,40 +71,18 @@ class Approach(NamedTuple):
         return self._replace(within_s=max(within_s, self.within_s))
 
     def lasting(self, within_s: float, limits: Limits) -> Approach:
-        """This shortest approach, extended to `within_s`.
-
-        Raises:
-            FollowError: That is too short; with the shortest time that would do.
-        """
+        """This shortest approach, extended to `within_s`. FollowError names the shortest time if that is too short."""
         if within_s * _SLACK >= self.within_s:
             return self.at_least(within_s)
-        parts = {
-            "braking alone": max(self.brake_s or (0.0,)),
-            "running up to the reference": max(self.run_up_s or (0.0,)),
-        }
-        turn_s = within_s - sum(parts.values())
-        if turn_s < LEAST_TURN_S:
-            why = " and ".join(f"{part} takes {seconds:g} s" for part, seconds in parts.items() if seconds)
-        else:
-            rate = (self.within_s - sum(parts.values())) / turn_s * limits.rate
-            why = (
-                f"in {within_s:g} s it would turn at {rounded_up(rate):g} rad/s, more than "
-                f"controller.max_reference_rate = {limits.rate:g} rad/s"
-            )
-        enough = self.within_s <= MAX_WITHIN_S
-        remedy = f"--in {rounded_up(self.within_s):g} would do" if enough else f"even {MAX_WITHIN_S:g} s would be"
-        raise FollowError(f"the approach is too short: {why}; {remedy}")
+        least_s = ceil(100 * self.within_s) / 100
+        remedy = f"--in {least_s:g} would do" if least_s <= MAX_WITHIN_S else f"even {MAX_WITHIN_S:g} s would be"
+        raise FollowError(
+            f"the approach is too short: with controller.max_reference_rate = {limits.rate:g} rad/s it takes longer "
+            f"than {within_s:g} s; {remedy}"
+        )
 
 
 JUMP: Final = Approach()
-
-
-def rounded_up(value: float) -> float:
-    """Three significant digits of a positive number that are not less."""
-    if not isfinite(value):
-        return value
-    digits = 2 - floor(log10(value))
-    return round(ceil(round(value * 10.0**digits, 6)) * 10.0**-digits, max(0, digits))
 
 
 def at_rest(angle: Floats) -> Angles:
@@ -114,12 +98,9 @@ def nearest_turn(attitude: Vector, target: Trajectory) -> Vector:
 
 
 def braked(state: Angles, brake_s: Floats, s: Floats) -> Angles:
-    """States on the way to rest: the rate is a cubic of time that ends at 0 without an acceleration.
+    """States on the way to rest, at times s since it began [s]; shape (n,). It begins in `state`, of shapes (1, 3).
 
-    Args:
-        state: Where it begins. Shapes (1, 3).
-        brake_s: Time that each axis takes [s]; 0 for one that is at rest. Shape (3,).
-        s: Times since it began [s]. Shape (n,).
+    The rate is a cubic of time that ends at 0 without an acceleration. Each axis takes its `brake_s` [s], 0 at rest.
     """
     angle, rate, acceleration = state
     T = np.where(brake_s > 0, brake_s, 1.0)
@@ -135,12 +116,12 @@ def braked(state: Angles, brake_s: Floats, s: Floats) -> Angles:
 def braking_times(state: Angles, limits: Limits) -> Floats:
     """Time in which each axis brakes to rest [s], whole milliseconds. Shape (3,).
 
-    The acceleration stays within `limits.braking`, or the present one where that is larger. Where rate or tilt would
-    exceed their limits meanwhile, because the body still gathers speed or is near the limit, it brakes harder.
+    The acceleration stays within BRAKING, or the present one where that is larger. Where rate or tilt would exceed
+    their limits meanwhile, because the body still gathers speed or is near the limit, it brakes harder.
     """
     rate, acceleration = np.abs(state.rate[0]), np.abs(state.acceleration[0])
     # `braked` accelerates by at most 3/2 rate / T + acceleration / 3, or by what it begins with.
-    times: Floats = 1.5 * rate / (np.maximum(limits.braking, acceleration) - acceleration / 3)
+    times: Floats = 1.5 * rate / (np.maximum(BRAKING, acceleration) - acceleration / 3)
     times = np.ceil(1000 * np.where(acceleration > 0, np.maximum(times, LET_GO_S), times)) / 1000
     for _ in range(_HARDER):
         way = braked(state, times, np.linspace(0.0, float(times.max()), SAMPLES))
@@ -214,10 +195,9 @@ def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limi
 
 
 def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -> Trajectory:
-    """A trajectory that reaches the target by an approach.
+    """A trajectory that reaches the target by an approach; the target's own time begins when it is reached.
 
-    The target's own time begins when it is reached. The approach begins at time t [s] from the state `here`, of shapes
-    (1, 3), unless it has one of its own, as `start` or `here`.
+    It begins at time t [s] from the state `here`, of shapes (1, 3), unless the approach has one of its own.
     """
     within_s, start, brake, run_up, begin = approach
     if start is not None:
@@ -243,12 +223,10 @@ def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -
 
 
 class Motion:
-    """The reference as the loop evaluates it, tick by tick, and `trajectory`, which is followed now.
+    """The reference as the loop evaluates it, tick by tick, from t = 0 on, and `trajectory`, which is followed now.
 
-    Args:
-        reference: What to follow from t = 0 on.
-        shared: Memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
-            function with the same inputs, which then evaluates the reference at the time last set.
+    `shared` is memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
+    function with the same inputs, which then evaluates the reference at the time last set.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
@@ -264,7 +242,7 @@ class Motion:
         self._time[0] = t
 
     def at(self, t: float) -> tuple[list[float], list[float], list[float]]:
-        """q_d [1], ω_d [rad/s] and ω̇_d [rad/s²] at time t [s], as `reference_function` has them."""
+        """q_d [1], ω_d [rad/s] and ω̇_d [rad/s²] at time t [s], the latter two inertial."""
         self.set(t)
         self._function()
         q_d, omega_d, omega_d_dot = map(list, self._function.outputs.values())

@@ -10,7 +10,6 @@ The extremes of a quintic are those of 65 samples, those of a sinusoid suprema o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 from itertools import product as combinations
@@ -53,13 +52,11 @@ class Limits(NamedTuple):
 
     Attributes:
         rate: Largest angular velocity [rad/s].
-        braking: Largest acceleration with which roll, pitch and yaw each brake before a motion [rad/s²].
         tilt: Largest angle between the body's z axis and the vertical [rad].
         rolls: Whether the vehicle can roll; a 2-DOF bench cannot.
     """
 
     rate: float
-    braking: float
     tilt: float
     rolls: bool
 
@@ -90,8 +87,7 @@ class Angles(NamedTuple):
         return tilts
 
 
-@dataclass(frozen=True)
-class Trajectory:
+class Trajectory(NamedTuple):
     """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends.
 
     Attributes:
@@ -114,7 +110,7 @@ class Trajectory:
         still = cls._polynomial(np.zeros(1), np.zeros((1, POWERS, 3)))
         if isinstance(reference, Sinusoid):
             amplitude = np.array([[a * (pi / 180) for a in reference.amplitude]])
-            return replace(still, amplitude=amplitude, frequency=np.array([reference.frequency]))
+            return still._replace(amplitude=amplitude, frequency=np.array([reference.frequency]))
         if isinstance(reference, Hold) and reference.attitude is not None:
             still.quintic[0, 0] = np.radians(reference.attitude)
         return still
@@ -142,18 +138,15 @@ class Trajectory:
         return Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
 
     def after(self, starts: Floats, lengths: Floats, knots: Angles) -> Trajectory:
-        """This trajectory from the last of these times on, preceded by quintics through the states at them.
+        """This trajectory from the last of these times on, preceded by quintics through the states `knots` at them.
 
-        Args:
-            starts: Times [s], increasing. Shape (n,).
-            lengths: Their differences, before they were rounded by an addition [s]. Shape (n − 1,).
-            knots: States, the last of them this trajectory's first. Shapes (n, 3).
+        `lengths` are the differences of the times before they were rounded by an addition [s]. Shapes (n,), (n − 1,)
+        and (n, 3); the last of the states is this trajectory's first.
         """
         here, there = Angles(*(part[:-1] for part in knots)), Angles(*(part[1:] for part in knots))
         way = self._polynomial(starts[:-1], join(here, there, lengths))
-        later = replace(self, starts=self.starts + starts[-1])
-        names = self.__annotations__
-        return Trajectory(*(np.concatenate([getattr(way, name), getattr(later, name)]) for name in names))
+        later = self._replace(starts=self.starts + starts[-1])
+        return Trajectory(*map(np.concatenate, zip(way, later, strict=True)))
 
     def piece(self, t: float) -> int:
         """Index of the piece that contains time t [s]."""
@@ -203,11 +196,7 @@ class Trajectory:
         value is ‖v‖, v a sum of products of factors φ of one axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K.
         Along the line from the maximum to the centre of its cell, up to d away in each phase, a product's second
         derivative is at most (d Σn)² ΠK. As ‖v‖' = 0 at the maximum, the value at that centre is less by no more than
-        half the sum of these.
-
-        Args:
-            value: ‖v‖ of each state; NaN and infinite ones are passed on. Shapes (n, 3) to (n,).
-            terms: Of each product its size ΠK, and Σn for the phases of roll, pitch and yaw. Shape (m, 4).
+        half the sum of these. `terms` has a row a product: its size ΠK, and Σn for the phases of roll, pitch and yaw.
         """
         most = float(value(self.samples()).max())
         sizes, degrees = terms[:, 0], terms[:, 1:]
@@ -284,11 +273,7 @@ def _locked(amplitude: Floats, frequency: Floats) -> Floats:
 
 
 def join(here: Angles, there: Angles, length: Floats) -> Floats:
-    """The quintics from states `here` to states `there`, of shape (n, 3), in `length` seconds, of shape (n,).
-
-    Returns:
-        Their coefficients. Shape (n, 6, 3).
-    """
+    """The quintics from states `here` to states `there` in `length` seconds. Shapes (n, 3), (n,), (n, 6, 3)."""
     (p, v, a), T = here, length[:, None]
     angle = there.angle - (p + v * T + a * T * T / 2)
     rate = (there.rate - (v + a * T)) * T
@@ -337,13 +322,7 @@ def desired(reference: Reference, period: float, ticks: int) -> Floats:
     trajectory = Trajectory.of(reference)
     t = np.arange(ticks) * period
     piece = np.maximum(0, np.searchsorted(trajectory.starts, t, side="right") - 1)
-    rows = (
-        t,
-        trajectory.starts[piece],
-        trajectory.quintic[piece],
-        trajectory.amplitude[piece],
-        trajectory.frequency[piece],
-    )
+    rows = t, *(part[piece] for part in trajectory)
     function = Compiled(reference_function().map(ticks))
     for memory, row in zip(function.inputs.values(), rows, strict=True):
         np.asarray(memory)[:] = row.ravel()

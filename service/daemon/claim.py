@@ -19,7 +19,6 @@ from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0
-_ANSWERS: Final[tuple[type[Grant | Refusal | Answer], ...]] = Grant, Refusal, Answer
 
 
 class SessionLostError(AeroloopError):
@@ -37,10 +36,7 @@ class ClaimClient:
     """
 
     def __init__(self, role: Node, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
-        self._role = role
-        self._loop = loop
-        self._wire = wire
-        self._auto_arm = auto_arm
+        self._role, self._loop, self._wire, self._auto_arm = role, loop, wire, auto_arm
         self.refusal = ""
         self.session: str | None = None
         self.last: SessionRecord | None = None
@@ -137,13 +133,13 @@ class ClaimClient:
 
     def _query(self, claim: Claim) -> Grant | Refusal | None:
         """The plant's answer; None if no plant answers in time."""
+        models: tuple[type[Grant | Refusal | Answer], ...] = Grant, Refusal, Answer
         key = topics.key("claim", self._role.vehicle)
         for reply in self._role.zenoh.get(key, payload=claim.encode(), timeout=ANSWER_WAIT_S):
-            if reply.ok is None:
-                continue
-            for model in _ANSWERS:
+            payload = reply.ok.payload.to_bytes() if reply.ok else b""
+            for model in models:
                 with suppress(MessageError):
-                    read = model.decode(reply.ok.payload.to_bytes())
+                    read = model.decode(payload)
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 

@@ -20,7 +20,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
 from aeroloop.service.daemon.claim import SessionLostError
-from aeroloop.service.daemon.session import Session, Shared
+from aeroloop.service.daemon.session import TELEMETRY_HZ, Session, Shared
 
 STATUS_PERIOD_S: Final = 1.0
 CLAIM_PERIOD_S: Final = 0.25
@@ -52,7 +52,7 @@ class Daemon:
         role, loop, machine, own = self._role, self._settings.loop, self._shared.machine, self._settings.controller
         if not loop.lockstep:
             self._notes = prepare_process(loop)
-        role.declare("telemetry", own.telemetry_rate_hz)
+        role.declare("telemetry", TELEMETRY_HZ)
         role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
         self._shared.changes.serve()
         role.serve("stand_down", Request, lambda _: self._stand_down)

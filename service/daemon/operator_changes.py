@@ -38,7 +38,14 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector, distance, to_eul
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
-from aeroloop.service.control.motion import Approach, nearest_turn, shortest, shortest_from_rest, to_set_point
+from aeroloop.service.control.motion import (
+    START_WITHIN_DEG,
+    Approach,
+    nearest_turn,
+    shortest,
+    shortest_from_rest,
+    to_set_point,
+)
 from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 
 START_S: Final = 1.0
@@ -50,32 +57,19 @@ _DECIMALS: Final = 3
 
 
 class OperatorChanges:
-    """Gains and reference of one controller, and their changes.
+    """Gains and reference of one controller, and their changes, which are recorded in the trace.
 
-    Args:
-        trace: Where changes are recorded.
-        why_none: Says why no session runs and what to do, where none does.
-
-    Attributes:
-        record: Gains and reference now, of the next session if none runs; a new object with every change, not with
-            every set-point of a stream.
-        setpoints: What an operator streams.
+    `record` has both as they are now, of the next session if none runs: a new object with every change, not with every
+    set-point of a stream. `why_none` says why no session runs and what to do.
     """
 
     def __init__(self, role: Node, settings: Settings, trace: TraceWriter, why_none: Callable[[], str]) -> None:
         law, own = settings.law, settings.controller
-        self._role = role
-        self._law = law
+        self._role, self._law, self._trace, self._why_none = role, law, trace, why_none
         self._configured = reference = settings.reference
-        self._settings = own
-        self._trace = trace
-        self._why_none = why_none
-        self._limits = Limits(
-            rate=own.max_reference_rate,
-            braking=own.max_reference_braking,
-            tilt=radians(own.max_reference_tilt_deg),
-            rolls=settings.wire.actuators > 2,
-        )
+        self._after_restart = own.after_restart
+        rolls = settings.wire.actuators > 2
+        self._limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=rolls)
         self.setpoints = SetpointStream(role)
         self._controller: Controller | None = None
         self._k = 0
@@ -92,7 +86,7 @@ class OperatorChanges:
             within_s=0.0,
             since_tick=0,
         )
-        if own.after_restart != "configured":
+        if self._after_restart != "configured":
             self._begin_with(Hold(), "held")
 
     # ── requests: checked in their topic's thread, applied between two ticks ──
@@ -114,12 +108,13 @@ class OperatorChanges:
     def _prepare_track(self, track: Track) -> Callable[[], Answer]:
         source: Source = "configured" if track.reference is None else "operator"
         reference = track.reference or self._configured
-        trajectory = self._check(reference)
+        trajectory = Trajectory.of(reference)
+        trajectory.check(self._limits)
         self._running()
         return lambda: self._track(reference, trajectory, track.within_s, source)
 
     def _set_gains(self, gains: Gains) -> Answer:
-        """Use other gains from this tick on. No event and no record if they change nothing."""
+        """No event and no record if the gains change nothing."""
         controller = self._running()
         before = controller.gains
         controller.set_gains(gains)
@@ -144,11 +139,8 @@ class OperatorChanges:
             approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
         self.setpoints.begin()
-        self._follow(held, trajectory, approach)
-        stream = reference if isinstance(reference, Stream) else held
-        self._update_record(reference=stream, reference_from=source, since_tick=self._k, **approach._asdict())
         text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
-        self._role.event("changed", text, self.record.session, self._k)
+        self._approach(held, trajectory, approach, text, reference, source)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
     # ── a session's start and end ──
@@ -158,7 +150,7 @@ class OperatorChanges:
         self._controller = controller
         self._k = 0
         self._update_record(session=session, since_tick=0, gains_since_tick=0)
-        if self._settings.after_restart == "resume":
+        if self._after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self.record.gains)
         controller.motion.follow(Trajectory.of(self._present_reference), 0.0)
@@ -171,7 +163,7 @@ class OperatorChanges:
         self._last = self.record.model_copy(update={"ended_tick": self._k})
         self._controller = None
         self._update_record(session=None)
-        if self._settings.after_restart == "hold":
+        if self._after_restart == "hold":
             self._begin_with(Hold(), "held")
 
     def _resume(self, last: SessionRecord | None) -> None:
@@ -181,7 +173,7 @@ class OperatorChanges:
             return
         reference = rest_of_reference(last, self._running().period)
         try:
-            self._check(reference)
+            Trajectory.of(reference).check(self._limits)
             with_gains(self._law, last.gains)
             gains = last.gains.over(self.record.gains)
         except (FollowError, LawError) as error:
@@ -195,7 +187,7 @@ class OperatorChanges:
             self._present_reference = Hold()  # until the first set-point
 
     def _begin_with(self, reference: Reference, source: Source, within_s: float = 0.0) -> None:
-        """Begin the next session with a reference; a hold without attitude holds the attitude found."""
+        """A hold without attitude holds the attitude found."""
         self._present_reference = reference
         self._update_record(reference=reference, reference_from=source, **Approach(within_s)._asdict())
 
@@ -218,22 +210,19 @@ class OperatorChanges:
         else:
             w, x, y, z = controller.motion.at(t)[0]
             away = degrees(distance(attitude, (w, x, y, z)))
-            if self._settings.after_restart == "configured" and away <= self._settings.start_within_deg:
+            if self._after_restart == "configured" and away <= START_WITHIN_DEG:
                 return
             trajectory = Trajectory.of(target)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
             approach = shortest_from_rest(trajectory, nearest_turn(start, trajectory), limits)
             approach = approach.at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
-        self._follow(target, trajectory, approach)
-        stream = self.record.reference if isinstance(self.record.reference, Stream) else target
-        self._update_record(reference=stream, since_tick=self._k, **approach._asdict())
-        self._role.event("changed", text, self.record.session, self._k)
+        self._approach(target, trajectory, approach, text, self.record.reference, self.record.reference_from)
 
     # ── in the loop ──
 
     def before_tick(self, k: int, frame: bytes) -> None:
-        """Apply the changes received since the last tick, from tick k on. The frame is the measurement of that tick."""
+        """Apply the changes received since the last tick, from tick k on; `frame` is the measurement of that tick."""
         self._k = k
         if not self._started_near:
             self._start_near(frame)
@@ -259,16 +248,19 @@ class OperatorChanges:
             return
         self._follow(hold, trajectory, approach)
 
+    def _approach(
+        self, to: Reference, trajectory: Trajectory, approach: Approach, text: str, asked: Reference, source: Source
+    ) -> None:
+        """Follow from this tick on; the record has it, or the stream that was asked for."""
+        self._follow(to, trajectory, approach)
+        reference = asked if isinstance(asked, Stream) else to
+        self._update_record(reference=reference, reference_from=source, since_tick=self._k, **approach._asdict())
+        self._role.event("changed", text, self.record.session, self._k)
+
     def _follow(self, reference: Reference, trajectory: Trajectory, approach: Approach) -> None:
         self._running().motion.follow(trajectory, self._time, approach)
         self._present_reference = reference
         self._record_change(reference=reference, **approach._asdict())
-
-    def _check(self, reference: Reference) -> Trajectory:
-        """The reference's trajectory, which takes time. Raises FollowError beyond the limits."""
-        trajectory = Trajectory.of(reference)
-        trajectory.check(self._limits)
-        return trajectory
 
     @property
     def _time(self) -> float:
@@ -323,17 +315,13 @@ def hold_here(attitude: Quaternion, *, rolls: bool) -> Vector:
 
 
 class SetpointStream:
-    """Set-points received for a role's vehicle, read in the loop.
-
-    Attributes:
-        refused: Set-points so far that were malformed, or beyond the limits.
-    """
+    """Set-points received for a role's vehicle, read in the loop."""
 
     def __init__(self, role: Node) -> None:
         self._role = role
         self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
         self._last_s = 0.0  # when the last one was read, or the stream begun; 0 once its silence was an event
-        self.refused = 0
+        self.refused = 0  # so far, malformed or beyond the limits
 
     def discard(self) -> None:
         """Discard those received before now, which are of the previous stream or session."""

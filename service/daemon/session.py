@@ -46,6 +46,11 @@ READ_S: Final = 0.01
 """How often they are read [s]."""
 STALL_TICKS: Final = 10
 """Ticks missed in a row that cause a warning."""
+TELEMETRY_HZ: Final = 10.0
+"""Telemetry is for people: the trace has every tick [Hz]."""
+LAW_TIMEOUT_S: Final = 0.1
+"""A tick of the law that takes longer faults the controller, except in lockstep [s]. By then the plant's watchdog, with
+its default time, has set 0 V."""
 REPORT_S: Final = 1.0
 """A tick that lasts longer is reported while it lasts [s]."""
 STOP_S: Final = 2.0
@@ -53,25 +58,19 @@ STOP_S: Final = 2.0
 
 
 class Shared:
-    """What one session leaves to the next: everything of the process but controller and link.
-
-    Attributes:
-        cause: Why the last session ended.
-        timing: Timing of the loop; None in lockstep.
-        age: From a measurement received to its command sent.
-    """
+    """What one session leaves to the next: everything of the process but controller and link."""
 
     def __init__(self, role: Node, settings: Settings, why_none: Callable[[], str]) -> None:
         loop, wire = settings.loop, settings.wire
         self.claims = ClaimClient(role, loop, wire, auto_arm=settings.controller.auto_arm)
         self.machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
-        self.cause = ""
+        self.cause = ""  # why the last session ended
         self.trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self.changes = OperatorChanges(role, settings, self.trace, why_none)
         self.plant = PlantStatus(role)
         self.watch = LawWatch(role, f"law {settings.law.kind}")
         self.timing = None if loop.lockstep else LoopTiming(clock=role.clock)
-        self.age = RollingHistogram(role.clock)
+        self.age = RollingHistogram(role.clock)  # from a measurement received to its command sent
         self.counts = Counts()
 
 
@@ -110,9 +109,8 @@ class Session:
         loop, own = settings.loop, settings.controller
         self._lockstep = loop.lockstep
         self._stale_s = own.stale_s
-        self._law_timeout_s = own.law_timeout_s
         self._last_tick = loop.ticks(own.duration_s) - 1 if own.duration_s else None
-        self._telemetry_every = max(1, round(loop.rate_hz / own.telemetry_rate_hz))
+        self._telemetry_every = max(1, round(loop.rate_hz / TELEMETRY_HZ))
         self._source = TickSource(link, loop, settings.wire, stale_s=own.stale_s, clock=role.clock)
         self._k = -1
         shared.machine.fire(Trigger.GRANT)
@@ -197,7 +195,7 @@ class Session:
         command = self.controller.tick(now.frame, now.tick)
         took_s, shared.watch.begun = clock.monotonic() - began, None
         fault = self.controller.fault
-        if took_s > self._law_timeout_s and not self._lockstep:
+        if took_s > LAW_TIMEOUT_S and not self._lockstep:
             command = None
             fault = f"law {self.controller.law.settings.kind} took {took_s:.3g} s for a tick"
         if command or (command is not None and self._lockstep):
@@ -231,10 +229,8 @@ class Session:
     def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
         """Add a row to the trace. A command that repeats the last one is silent, in lockstep too."""
         sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
-        if command is None:
-            sent_ns = 0
-        tick = max(now.tick, 0)
-        row = ControllerRow(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        times = now.at_ns, 0 if command is None else sent_ns
+        row = ControllerRow(max(now.tick, 0), now.received_as, sent_as, *times, now.frame, command or b"")
         self._shared.trace.row(row)
         self._publish_trace_when_due()
 
@@ -255,7 +251,6 @@ class Session:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self.name, now.tick)
 
     def _advance_state(self, tick: int, fault: str | None) -> None:
-        """Move the state machine after an answer."""
         machine, role = self._shared.machine, self._role
         if fault is not None:
             machine.fire(Trigger.FAULT)
@@ -283,24 +278,19 @@ def telemetry_of(controller: Controller, session: str) -> Telemetry:
         rate_error=controller.rate_error,
         desired=controller.desired,
         state=controller.law_state,
-        voltages=tuple(controller.voltages),
+        voltages=controller.voltages,
     )
 
 
 class PlantStatus:
-    """The plant's newest status.
-
-    Attributes:
-        granted: Whether a status has named the session that is followed.
-    """
+    """The plant's newest status; `granted` is whether one has named the session that is followed."""
 
     def __init__(self, role: Node) -> None:
         self._role = role
         self._newest: Status | None = None
         self._due_s = 0.0
         self._appeared = 0  # how often the plant's token has appeared or disappeared
-        self._session = ""
-        self.granted = False
+        self._session, self.granted = "", False
         self._received = role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role="plant"), RingChannel(STATUSES)
         )
@@ -342,21 +332,16 @@ class LawWatch(Thread):
 
     The plant needs none of it: without commands its watchdog sets 0 V. But a loop that hangs in a user's code can
     neither say so nor stop when it is asked to.
-
-    Attributes:
-        begun: When the tick that runs began, on the node's clock; None between ticks. The loop sets it.
     """
 
     def __init__(self, role: Node, law: str) -> None:
         super().__init__(name="law watch", daemon=True)
-        self._role = role
-        self._law = law
-        self.begun: float | None = None
+        self._role, self._law = role, law
+        self.begun: float | None = None  # when the tick that runs began; None between ticks
 
     def run(self) -> None:
         """Watch until the process ends."""
-        reported: float | None = None
-        stopping: float | None = None
+        reported = stopping = None
         while True:
             time.sleep(0.1)
             begun, now = self.begun, self._role.clock.monotonic()

@@ -48,12 +48,9 @@ class PlantTick(NamedTuple):
 
 
 class TickSource:
-    """Ticks of one session.
+    """Ticks of one session, `tick` the last of them, −1 before the first; `clock` is that of the link's arrivals.
 
     The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
-
-    `tick` is the last, −1 before the first. A frame that arrives later than `stale_s` [s] is not answered. `clock` is
-    that of the link's arrivals.
     """
 
     def __init__(self, link: Link, loop: LoopSettings, wire: WireSpec, *, stale_s: float, clock: Clock = time) -> None:
@@ -84,13 +81,13 @@ class TickSource:
         stale = late_ns > self._stale_ns
         # The newer frame, or the silence of the next tick, wins: then the tick of this frame is missed.
         if stale or (self._sparse and (tick <= self.tick or self._link.pending or self._last_over() > tick)):
-            return self._not_a_tick(tick, arrival, Received.LATE, late_ns, fresh=not stale)
+            return PlantTick(tick, arrival.frame, Received.LATE, arrival.at_ns, late_ns, fresh=not stale)
         return self._as_tick(tick, arrival, Received.FRAME, late_ns, fresh=True)
 
     def _without_counter(self, arrival: Arrival) -> PlantTick:
         """An empty frame in lockstep, or a malformed one, which counts as the measurement that was due."""
         if self._sparse:
-            return self._not_a_tick(self.tick, arrival, Received.MALFORMED, 0, fresh=False)
+            return PlantTick(self.tick, arrival.frame, Received.MALFORMED, arrival.at_ns)
         tick = self.tick + 1
         if self._lockstep:
             self._ticks.tick = tick
@@ -103,17 +100,11 @@ class TickSource:
         return self._link.wait(timeout_s)
 
     def _over_ns(self, tick: int) -> int:
-        """When a tick without a frame becomes silent."""
         return self._ticks.due_ns(tick) + self._patience_ns
 
     def _last_over(self) -> int:
         """The last tick that is silent if it has no frame by now."""
         return self._ticks.tick_at(self._clock.monotonic_ns() - self._patience_ns)
-
-    def _not_a_tick(
-        self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool
-    ) -> PlantTick:
-        return PlantTick(tick, arrival.frame, received_as, arrival.at_ns, late_ns, fresh=fresh)
 
     def _silence(self) -> PlantTick | None:
         """The last tick that is silent now; those before it, back to the last one taken, are missed."""

@@ -24,7 +24,7 @@ from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.host.operator import send, stop
-from aeroloop.service.points_file import read_points
+from aeroloop.service.settings import read_points
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import PATIENCE_S, ProcessGroup, RoleName, free_rendezvous, private_bus
 from aeroloop.service.testing.process_group import HilError as HilError

@@ -73,8 +73,8 @@ class Known:
             "max ∡e/2",
             "Assumption 3",
             "rad",
-            "assumed: the attitude error stays below twice this; from --attitude-error, else "
-            "controller.start_within_deg, within which sessions begin; at least that of the invariant set",
+            "assumed: the attitude error stays below twice this; from --attitude-error, else 20°, within which "
+            "sessions begin; at least that of the invariant set",
         ),
     ]
     k_theta: Annotated[

@@ -26,6 +26,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_class, words_of
+from aeroloop.service.control.motion import START_WITHIN_DEG
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.extremes import BoundlessError, Extremes, chords, extremes, motors
 from aeroloop.service.theorem.feedback import NoTheoremError, feedback_of
@@ -160,7 +161,7 @@ def evaluate(
     body_reach, plant_reach = reach(body), reach(plant)
     paper = None
     if isinstance(settings.law, AdaptiveSettings):
-        start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
+        start_deg = START_WITHIN_DEG if attitude_error_deg is None else attitude_error_deg
         angles = [radians(min(180.0, start_deg)), *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at)]
         known = _known(settings, settings.law, desired, body, max(angles))
         lemma = lemma_1(known)
@@ -251,7 +252,7 @@ def certify(
     Args:
         settings: The configuration.
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
-        attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
+        attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; 20° if None, within which sessions begin.
         late_s: Further age of a command, by delay, or by lost frames where the law has no integral [s].
         margins: Search delay_ms and lost_frames, too.
 

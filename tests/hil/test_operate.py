@@ -50,7 +50,7 @@ def refused(hil: Hil, *arguments: str) -> str:
 
 @pytest.mark.smoke
 def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_again_to_the_last_bit(hil: Hil) -> None:
-    hil.start(settings={**PATIENT, "reference.kind": "hold", "controller.telemetry_rate_hz": 500})
+    hil.start(settings={**PATIENT, "reference.kind": "hold"})
     done(hil, "goto", "0", "-10", "20", "--in", "1")
     done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
     assert " would do" in refused(hil, "goto", "0", "0", "170", "--in", "0.5")  # the first may still have to brake
@@ -66,7 +66,7 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     computed = dict(zip(ticks.k.tolist(), map(tuple, ticks.attitude_error.tolist()), strict=True))
     published = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
     compared = [(message.attitude_error, computed[message.tick]) for message in published if message.tick in computed]
-    assert len(compared) > 500
+    assert len(compared) > 10  # telemetry is published at 10 Hz
     assert all(mine == theirs for mine, theirs in compared)
 
 

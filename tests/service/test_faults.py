@@ -16,27 +16,23 @@ ONSET_S = 3.0
 
 
 def run(fault: str, seconds: float = 20.0) -> Figures:
-    return run_experiment(load(overrides=[f'plant.faults=["{fault}@{ONSET_S:g}"]']), seconds)
+    return run_experiment(load(overrides=[f'plant.faults=["{fault}"]']), seconds)
 
 
 @pytest.mark.parametrize(
     ("fault", "cause", "within_s"),
     [
         ("attitude:off", "the sensors have had no valid value for 102 ms", 0.104),
-        ("rate:off", "the sensors have had no valid value for 102 ms", 0.104),
         ("rate.z:off", "the sensors have had no valid value for 102 ms", 0.104),
         ("attitude:garble=0.02", "tilted by", 1.0),
         ("attitude:stuck", "a motor has been at its voltage limit", 5.0),
         ("motor1:off", "a motor has been at its voltage limit", 5.0),
-        ("motor2:off", "a motor has been at its voltage limit", 5.0),
-        ("motors:off", "a motor has been at its voltage limit", 5.0),
-        ("motor1:stuck", "a motor has been at its voltage limit", 15.0),
         ("rate:stuck", "tilted by", 15.0),
     ],
 )
 def test_what_cannot_be_ridden_out_ends_at_zero_volts_with_its_cause(fault: str, cause: str, within_s: float) -> None:
     with pytest.raises(ValueError, match=cause) as ended:
-        run(fault)
+        run(f"{fault}@{ONSET_S:g}")
     seconds = float(str(ended.value).split("after ")[1].split(" s:")[0])
     assert ONSET_S < seconds <= ONSET_S + within_s
 
@@ -44,33 +40,27 @@ def test_what_cannot_be_ridden_out_ends_at_zero_volts_with_its_cause(fault: str,
 @pytest.mark.parametrize(
     ("fault", "bound"),
     [
-        ("attitude:drop=0.05", 45e-4),  # 22e-4, and 20e-4 without a fault
-        ("attitude:drop=0.2", 62e-4),
+        ("attitude:drop=0.2", 62e-4),  # 20e-4 without a fault
         ("attitude:noise=0.02", 145e-4),
         ("attitude:bias=0.1", 1200e-4),
-        ("attitude:delay=0.1", 48e-4),
-        ("rate:bias=0.1", 175e-4),
-        ("rate:noise=0.1", 47e-4),
         ("rate:garble=0.02", 46e-4),
         ("motor1:bias=5", 67e-4),
-        ("motors:noise=3", 41e-4),
         ("motors:delay=0.05", 206e-4),
-        ("motors:drop=0.2", 61e-4),
     ],
 )
 def test_what_can_be_ridden_out_is(fault: str, bound: float) -> None:
-    figures = run(fault)
+    figures = run(f"{fault}@{ONSET_S:g}")
     assert figures.duration_s == 20.0
     assert figures.z_track is not None
     assert 20e-4 < figures.z_track < bound
 
 
 def test_a_fault_that_is_over_leaves_the_loop_as_good_as_before() -> None:
-    spell = run_experiment(load(overrides=['plant.faults=["rate:bias=0.5@3..5"]']), 20.0)
+    spell = run("rate:bias=0.5@3..5")
     assert spell.final_error_deg is not None
     assert spell.final_error_deg < 1.5  # 0.9 without a fault, 14 with it
 
 
 def test_faults_on_frames_are_refused_where_no_network_is() -> None:
     with pytest.raises(ValueError, match="demo --lockstep"):
-        run_experiment(load(overrides=['plant.faults=["command:drop=0.1"]']), 1.0)
+        run("command:drop=0.1", 1.0)

@@ -23,19 +23,10 @@ COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 DURATION = 1.5
-POLICIES: list[tuple[Policy, Policy]] = [
-    ("on_change", "on_change"),
-    ("on_change", "periodic"),
-    ("periodic", "on_change"),
-]
+POLICIES: list[tuple[Policy, Policy]] = [("on_change", "on_change"), ("on_change", "periodic")]
 GAPS = ('plant.faults=["rate:off@0.2..0.3", "attitude.z:off@0.6..0.602"]', "plant.limits.max_invalid_s=1")
 RIGID_BODY = Path(examples.__path__[0]) / "rigid-body.toml"
-LOOPS = {
-    "Aero": load(),
-    "Aero with gaps": load(overrides=GAPS),
-    "rigid body": load(RIGID_BODY),
-    "rigid body with gaps": load(RIGID_BODY, GAPS),
-}
+LOOPS = {"Aero with gaps": load(overrides=GAPS), "rigid body": load(RIGID_BODY)}
 
 
 def sending(settings: Settings, measurement: Policy, command: Policy) -> Settings:
@@ -135,7 +126,7 @@ def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_ho
     assert late.tick(UNCHANGED, 2) == in_time.tick(measurement(2, 0.3), 2)
 
 
-@pytest.mark.parametrize("at", [0, 1, 5, 9, 23])
+@pytest.mark.parametrize("at", [0, 5, 23])
 def test_a_restored_controller_goes_on_with_the_levels_it_held_and_what_it_sent(at: int) -> None:
     """Also after a late frame, and between two heartbeats: no byte and no silence differs."""
 
@@ -164,10 +155,6 @@ def test_a_restored_controller_goes_on_with_the_levels_it_held_and_what_it_sent(
         (("controller.stale_s=0.059",), "controller.stale_s, which is 59 ms"),
         (("wire.transmit.heartbeat_s=0.06", "loop.rate_hz=100"), "60 ms pass without a command"),
         (("loop.rate_hz=250", "wire.transmit.heartbeat_s=1"), "508 ms pass without a command"),  # 127 ticks
-        (
-            ("loop.rate_hz=100", "wire.transmit.heartbeat_s=1", "wire.counter_bits=5"),
-            "150 ms pass without a command",  # 15 ticks
-        ),
     ],
 )
 def test_a_heartbeat_that_cannot_keep_both_ends_alive_is_refused_in_one_line(
@@ -186,7 +173,6 @@ def test_a_heartbeat_that_cannot_keep_both_ends_alive_is_refused_in_one_line(
         ("plant.watchdog_s=0.06", "controller.stale_s=0.06"),
         ("loop.rate_hz=1000", "wire.transmit.heartbeat_s=0.05"),  # half the watchdog, 50 ticks
         ("loop.rate_hz=5",),  # a period alone is longer, and every tick has a frame as ever
-        ("loop.rate_hz=100", "wire.transmit.heartbeat_s=0.05"),
         ("loop.lockstep=true", "plant.watchdog_s=0.01"),  # silence travels there, and is an answer
         ("wire.transmit.command=periodic", "plant.watchdog_s=0.01"),  # each end's own direction counts
         ("wire.transmit.measurement=periodic", "controller.stale_s=0.01"),

@@ -21,7 +21,6 @@ from aeroloop.service.testing.hil import Hil, HilError
 pytestmark = pytest.mark.processes
 
 PATIENCE_S = 120
-LAW = "aeroloop.service.examples.own_law:OwnLaw"
 
 
 @pytest.fixture
@@ -78,20 +77,6 @@ def test_the_law_tracks_the_papers_reference(folder: Path, kind: str) -> None:
     assert found["max_error_deg"] < 6
     wrong = "--set", f"law.kind=own_law:{kind}", "--set", "law.stifness=[1,1,1]"
     assert "did you mean law.stiffness?" in run(folder, "lab", "experiment", *wrong, code=2)
-
-
-def test_its_gains_change_in_a_loop_that_runs_and_only_within_their_bounds(hil: Hil) -> None:
-    hil.start(settings={"law.kind": LAW, "loop.lockstep": True})
-    hil.run(0.2)
-    hil.set_gains(stiffness=[1.5, 1.5, 1.5])
-    hil.run(0.2)
-    with pytest.raises(HilError, match=r"stiffness\[2\]: .* 20, not 30"):
-        hil.set_gains(stiffness=[1.0, 1.0, 30.0])
-    with pytest.raises(HilError, match=r"has no gain C2; it has stiffness, damping"):
-        hil.set_gains(C2=[1.0, 1.0, 1.0])
-    hil.run(0.2)
-    changed = [change.gains.named for change in hil.log.changes if change.gains is not None]
-    assert changed[-1]["stiffness"] == (1.5, 1.5, 1.5)
 
 
 @pytest.mark.parametrize(

@@ -174,6 +174,3 @@ class Slow(FourthTick):
 
 class NoLaw:
     """Derives from no law."""
-
-
-not_even_a_class = 3

@@ -24,7 +24,6 @@ bound (C.30).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
 import casadi as ca
@@ -36,7 +35,6 @@ from aeroloop.service.control.laws.interface import (
     ExpressionLaw,
     MatrixGain,
     Now,
-    check_allocation,
     gravity_torque,
     voltages_for,
 )
@@ -54,46 +52,20 @@ class AdaptiveSettings(EstimateSettings):
     Gamma: MatrixGain = Field(default=(0.02, 0.02, 0.02), description="adaptation gain [N·m·s²/rad² per s]")
 
 
-@dataclass(frozen=True)
-class Equations:
-    """The law's expressions, each as named in the module's table, and what they are built from."""
-
-    q: ca.SX
-    omega: ca.SX
-    q_d: ca.SX
-    omega_d: ca.SX
-    omega_d_dot: ca.SX
-    theta: ca.SX
-    s: ca.SX
-    C1: ca.SX
-    C2: ca.SX
-    Gamma: ca.SX
-    eta_e: ca.SX
-    eps_e: ca.SX
-    omega_e: ca.SX
-    z1: ca.SX
-    z2: ca.SX
-    u: ca.SX
-    tau: ca.SX
-    theta_dot: ca.SX
-
-
 _GIVEN: Final = ("q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C1", "C2", "Gamma")
 
 
-def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX] | None = None) -> Equations:
-    """The law for these parameters, as CasADi expressions.
+def equations(p: AdaptiveSettings, actuators: int, given: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
+    """The law for these parameters, as CasADi expressions: eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot by name.
 
     Args:
         p: Parameters; the gains are not taken from them.
         actuators: Number of voltages.
-        given: What to build them from: q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2, Gamma; symbols if None.
+        given: What to build them from, those of the module's table down to C1, C2 and Gamma.
 
     Raises:
         ValueError: B cannot be inverted, or does not fit so many actuators.
     """
-    check_allocation(p, actuators)
-    given = given or {name: ca.SX.sym(name, {"q": 4, "q_d": 4, "s": 1}.get(name, 3)) for name in _GIVEN}
     q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains = (given[name] for name in _GIVEN)
     C1, C2, Gamma = (ca.diag(gain) for gain in gains)
     J = ca.diag(ca.SX(p.inertia))
@@ -122,8 +94,8 @@ def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX
     tau = Gamma @ Phi @ z2  # (C.23)
     theta_dot = projection(tau, theta - ca.SX(p.damping_estimate), Gamma, p.damping_bound)  # (C.38)
 
-    found = {"eta_e": eta_e, "eps_e": eps_e, "omega_e": omega_e, "z1": z1, "z2": z2, "u": u}
-    return Equations(**given, **found, tau=tau, theta_dot=theta_dot)
+    names = ("eta_e", "eps_e", "omega_e", "z1", "z2", "u", "tau", "theta_dot")
+    return dict(zip(names, (eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot), strict=True))
 
 
 def projection(tau: ca.SX, moved: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
@@ -133,11 +105,7 @@ def projection(tau: ca.SX, moved: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
     k_θ/0.95 a growing share of the outward component is removed. So −θ̃ᵀΓ⁻¹Proj{τ} ≤ −θ̃ᵀΓ⁻¹τ for every θ in the ball:
     what is removed is along Γ(θ̂ − θ̂(t₀)), and θ̃ᵀ(θ̂ − θ̂(t₀)) < 0 where any is.
 
-    Args:
-        tau: Γ Φ z₂, the update without projection. Shape (3,).
-        moved: θ̂ − θ̂(t₀). Shape (3,).
-        Gamma: Adaptation gain. Shape (3, 3).
-        bound: k_θ [N·m·s/rad].
+    `tau` is Γ Φ z₂, the update without projection, shape (3,); `moved` θ̂ − θ̂(t₀); `bound` k_θ [N·m·s/rad].
     """
     outer = ESTIMATE_REACH * bound
     outside = (ca.dot(moved, moved) - bound**2) / (outer**2 - bound**2)
@@ -157,7 +125,6 @@ class Adaptive(ExpressionLaw[AdaptiveSettings]):
     units: ClassVar = {"damping_estimate": "N·m·s/rad"}
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        """θ̂(t0), and no sign yet."""
         return {"damping_estimate": self.settings.damping_estimate, "sign": (0.0,)}
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
@@ -167,8 +134,8 @@ class Adaptive(ExpressionLaw[AdaptiveSettings]):
         motion = now.attitude, now.rate, now.desired_attitude, now.desired_rate, now.desired_acceleration
         given = dict(zip(_GIVEN, (*motion, theta, s, *(now.gains[name] for name in self.gains)), strict=True))
         law = equations(self.settings, self.actuators, given)
-        theta_next = theta + self.period * law.theta_dot
+        theta_next = theta + self.period * law["theta_dot"]
         # Euler's step leaves the outer ball along its tangent; the projection keeps θ̂ within in continuous time only.
         moved = theta_next - ca.SX(self.settings.damping_estimate)
         theta_next -= ca.fmax(0, 1 - ESTIMATE_REACH * bound / ca.fmax(ca.norm_2(moved), 1e-300)) * moved
-        return law.u, {"damping_estimate": theta_next, "sign": s}
+        return law["u"], {"damping_estimate": theta_next, "sign": s}

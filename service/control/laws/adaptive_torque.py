@@ -104,7 +104,6 @@ class AdaptiveTorque(ExpressionLaw[AdaptiveTorqueSettings]):
     units: ClassVar = {"torque_estimate": "N·m", "damping_estimate": "N·m·s/rad", "coulomb_estimate": "N·m"}
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        """The first estimates, and no sign yet."""
         p = self.settings
         estimates = {"damping_estimate": p.damping_estimate, "coulomb_estimate": p.coulomb_estimate}
         return {"sign": (0.0,), "torque_estimate": (0.0, 0.0, 0.0), **estimates}

@@ -20,9 +20,8 @@ and the damping ratio that the paper's gains give, and knows the same body.
 
 q and −q are one attitude, so the feedback approaches e = [1, 0] or [−1, 0]. Which one is chosen at the first tick; it
 changes where the other has become nearer by more than the hysteresis, so that a body that was turned by hand does not
-turn back all the way (unwinding), and noise at half a turn does not make it hesitate: Mayhew, Sanfelice and Teel,
-Quaternion-Based Hybrid Control for Robust Global Attitude Tracking, IEEE Transactions on Automatic Control 56(11),
-2011.
+turn back all the way (unwinding): Mayhew, Sanfelice and Teel, Quaternion-Based Hybrid Control for Robust Global
+Attitude Tracking, IEEE Transactions on Automatic Control 56(11), 2011.
 """
 
 from __future__ import annotations
@@ -80,14 +79,14 @@ def response_of(inertia: Vector, C1: Vector, C2: Vector) -> Response:
     axes = list(zip(inertia, C1, C2, strict=True))
     bandwidth = [sqrt((1 + c1 * c2) / (2 * J)) for J, c1, c2 in axes]
     damping = [(c2 / J + c1 / 2) / (2 * wn) for (J, c1, c2), wn in zip(axes, bandwidth, strict=True)]
-    return Response(*(_rounded(values, digits=15) for values in (bandwidth, damping)))
+    return Response(_rounded(bandwidth, digits=15), _rounded(damping, digits=15))
 
 
 def tuned(kind: str, body: LawSettings, response: Response) -> dict[str, Vector]:
     """The settings, by name, that give a law of this kind a response with this body; none for a kind without a rule."""
     torques = [sum(map(abs, row)) for row in body.allocation]
     axes = [_tuned_axis(kind, *axis) for axis in zip(body.inertia, torques, *response, strict=True)]
-    return {name: _rounded([axis[name] for axis in axes]) for name in axes[0]}
+    return {name: _rounded([axis[name] for axis in axes], digits=5) for name in axes[0]}
 
 
 def _tuned_axis(kind: str, J: float, torque_per_volt: float, wn: float, zeta: float) -> dict[str, float]:
@@ -115,8 +114,7 @@ def _tuned_axis(kind: str, J: float, torque_per_volt: float, wn: float, zeta: fl
     return {}
 
 
-def _rounded(values: list[float], digits: int = 5) -> Vector:
-    """So that a reader can copy it."""
+def _rounded(values: list[float], digits: int) -> Vector:
     x, y, z = (float(f"{value:.{digits}g}") for value in values)
     return x, y, z
 
@@ -144,7 +142,6 @@ class TrackingLaw(ExpressionLaw[T]):
     """Feedforward of the model, and a feedback."""
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        """The sign, not yet chosen."""
         return {"sign": [0.0]}
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
@@ -160,13 +157,7 @@ class TrackingLaw(ExpressionLaw[T]):
 
 
 def nearer(eta_e: ca.SX, before: ca.SX, hysteresis: float) -> ca.SX:
-    """±1, the equilibrium to approach: as before, until the other is nearer by the hysteresis. Shape (1,).
-
-    Args:
-        eta_e: η̃ [1].
-        before: ±1 at the last tick; 0 before the first.
-        hysteresis: |η̃| from which the other is approached [1].
-    """
+    """±1, the equilibrium to approach: as `before`, 0 at first, until the other is nearer by the hysteresis [1]."""
     kept = before * (1 - 2 * (before * eta_e < -hysteresis))
     return ca.if_else(before == 0, 2 * (eta_e >= 0) - 1, kept)
 
@@ -203,7 +194,6 @@ class PD(TrackingLaw[PDSettings]):
     gains = ("kp", "kd")
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """Proportional to both errors."""
         return -now.gains["kp"] * sign * now.attitude_error[1:4] - now.gains["kd"] * now.rate_error, {}
 
 
@@ -231,10 +221,9 @@ class PID(TrackingLaw[PIDSettings]):
 
         ė_I = ω_e ± c ε̃ + B(u − sat u)/(k_i T_t)
 
-    Integral and its Lyapunov function: F. Goodarzi, D. Lee and T. Lee, Geometric Nonlinear PID Control of a Quadrotor
-    UAV on SE(3), European Control Conference, 2013, with ε̃ in place of their error in SO(3). Back-calculation: K. J.
-    Åström and T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd edition, 1995, section on integrator
-    windup.
+    Integral: F. Goodarzi, D. Lee and T. Lee, Geometric Nonlinear PID Control of a Quadrotor UAV on SE(3), European
+    Control Conference, 2013, with ε̃ in place of their error in SO(3). Back-calculation: K. J. Åström and T. Hägglund,
+    PID Controllers: Theory, Design, and Tuning, 2nd edition, 1995, section on integrator windup.
     """
 
     Settings = PIDSettings
@@ -242,11 +231,9 @@ class PID(TrackingLaw[PIDSettings]):
     units: ClassVar = {"integral": "rad"}
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        """Nothing integrated yet."""
         return {**super().initial(), "integral": [0.0] * 3}
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """Proportional to both errors and to their integral."""
         eps_e = sign * now.attitude_error[1:4]
         e_I = now.state["integral"]
         torque = -now.gains["kp"] * eps_e - now.gains["kd"] * now.rate_error - now.gains["ki"] * e_I
@@ -280,16 +267,13 @@ class Sliding(TrackingLaw[SlidingSettings]):
 
     On the surface σ = 0, ε̃ decays with the time constant 2/λ. Surface: J. L. Crassidis, S. R. Vadali and F. L. Markley,
     Optimal Variable-Structure Control Tracking of Spacecraft Maneuvers, Journal of Guidance, Control, and Dynamics
-    23(3), 2000; boundary layer against chatter: J.-J. E. Slotine and W. Li, Applied Nonlinear Control, 1991, chapter 7;
-    S.-C. Lo and Y.-P. Chen, Smooth Sliding-Mode Control for Spacecraft Attitude Tracking Maneuvers, Journal of
-    Guidance, Control, and Dynamics 18(6), 1995. The layer is tanh's.
+    23(3), 2000; boundary layer against chatter: J.-J. E. Slotine and W. Li, Applied Nonlinear Control, 1991, chapter 7.
     """
 
     Settings = SlidingSettings
     gains = ("slope", "strength")
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """Along the surface, and towards it."""
         p, slope = self.settings, sign * now.gains["slope"]
         eta_e, eps_e, omega_e = now.attitude_error[0], now.attitude_error[1:4], now.rate_error
         sigma = omega_e + slope * eps_e
@@ -315,56 +299,38 @@ class LQRSettings(TrackingSettings):
 class LQR(TrackingLaw[LQRSettings]):
     """The discrete-time optimal regulator of the errors. Its gains follow from weights and period, so none may change.
 
-    With the feedforward an axis is a double integrator, J φ̈ = τ with φ = ±2ε̃ to first order, held for a period. K is
-    computed when the law is built; it holds near the reference only. B. D. O. Anderson and J. B. Moore, Optimal
-    Control: Linear Quadratic Methods, 1990.
+    With the feedforward an axis is a double integrator, J φ̈ = τ with φ = ±2ε̃ to first order, held for a period. B. D.
+    O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
     """
 
     Settings = LQRSettings
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """Optimal for small errors."""
         p = self.settings
-        K = ca.SX(optimal_gains(p.inertia, p.attitude_weight, p.rate_weight, self.period))
+        axes = zip(p.inertia, p.attitude_weight, p.rate_weight, strict=True)
+        K = ca.SX(np.array([optimal_gain(J, angle, rate, self.period) for J, angle, rate in axes]))
         return -K[:, 0] * 2 * sign * now.attitude_error[1:4] - K[:, 1] * now.rate_error, {}
 
 
-def optimal_gains(inertia: Vector, attitude_weight: Vector, rate_weight: Vector, period: float) -> Floats:
-    """Gains of angle [N·m/rad] and rate [N·m·s/rad], a row an axis. Shape (3, 2)."""
-    axes = zip(inertia, attitude_weight, rate_weight, strict=True)
-    found: Floats = np.array([_gain(J, np.diag([angle, rate]), period) for J, angle, rate in axes])
-    return found
+def optimal_gain(J: float, attitude_weight: float, rate_weight: float, T: float) -> Floats:
+    """Gains of angle [N·m/rad] and rate [N·m·s/rad] for ticks of T [s]: K of x⁺ = A x + B τ, Σ xᵀQx + τ². Shape (2,).
 
-
-def _gain(J: float, Q: Floats, T: float) -> Floats:
-    """K of x⁺ = A x + B τ and the cost Σ xᵀQx + τ². Shape (2,)."""
-    A = np.array([[1.0, T], [0.0, 1.0]])
-    B = np.array([[T * T / 2], [T]]) / J
-    X = riccati(A, B @ B.T, Q)
-    gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
-    return gain
-
-
-_DOUBLINGS: Final = 60
-"""Each doubles the horizon in ticks; a loop that slow has ended before."""
-
-
-def riccati(A: Floats, G: Floats, Q: Floats) -> Floats:
-    """The stabilising X = AᵀX(I + GX)⁻¹A + Q. Shapes (n, n).
-
-    By doubling: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang, Structure-Preserving Algorithms for Periodic
-    Discrete-Time Algebraic Riccati Equations, International Journal of Control 77(8), 2004. SciPy, whose
-    `solve_discrete_are` would do, is no dependency of the core.
+    X = AᵀX(I + BBᵀX)⁻¹A + Q by doubling the horizon: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang,
+    Structure-Preserving Algorithms for Periodic Discrete-Time Algebraic Riccati Equations, International Journal of
+    Control 77(8), 2004. SciPy, whose `solve_discrete_are` would do, is no dependency of the core.
 
     Raises:
         ValueError: The doubling does not end.
     """
-    X = Q
-    for _ in range(_DOUBLINGS):
-        W = np.linalg.inv(np.eye(len(A)) + G @ X)
-        A, G, X, last = A @ W @ A, G + A @ W @ G @ A.T, X + A.T @ X @ W @ A, X
+    A, B = np.array([[1.0, T], [0.0, 1.0]]), np.array([[T * T / 2], [T]]) / J
+    X = np.diag([attitude_weight, rate_weight])
+    F, G = A, B @ B.T
+    for _ in range(60):  # of 2⁶⁰ ticks
+        W = np.linalg.inv(np.eye(2) + G @ X)
+        F, G, X, last = F @ W @ F, G + F @ W @ G @ F.T, X + F.T @ X @ W @ F, X
         if np.abs(X - last).max() <= 1e-14 * np.abs(X).max():
-            return X
+            gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
+            return gain
     raise ValueError("law: these weights and this period have no optimal gains")
 
 
@@ -388,17 +354,12 @@ class Nonadaptive(ExpressionLaw[NonadaptiveSettings]):
     Settings = NonadaptiveSettings
     gains = ("C1", "C2")
 
-    def __init__(self, settings: NonadaptiveSettings, period: float, actuators: int) -> None:
-        super().__init__(settings, period, actuators)
-        self._adaptive = Adaptive(AdaptiveSettings(**settings.model_dump(exclude={"kind"})), period, actuators)
-
     def initial(self) -> Mapping[str, Sequence[float]]:
-        """No sign yet."""
         return {"sign": (0.0,)}
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """(C.37)."""
-        theta = ca.SX(self.settings.damping_estimate)
+        adaptive = Adaptive(AdaptiveSettings(**self.settings.model_dump(exclude={"kind"})), self.period, self.actuators)
         gains = {**now.gains, "Gamma": ca.SX.zeros(3)}
-        u, state = self._adaptive.expressions(now._replace(gains=gains, state={**now.state, "damping_estimate": theta}))
+        known = {**now.state, "damping_estimate": ca.SX(self.settings.damping_estimate)}
+        u, state = adaptive.expressions(now._replace(gains=gains, state=known))
         return u, {"sign": state["sign"]}

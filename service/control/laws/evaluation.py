@@ -1,4 +1,4 @@
-"""Evaluation of a law at one tick: the attitude as received, the errors, and the law's expressions as one function."""
+"""One tick of a law as a function: the attitude as received, the errors, and the law's own expressions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from aeroloop.service.control.laws.registry import naming
 
 
 def received(eps: ca.SX, last: ca.SX) -> ca.SX:
-    """q^Q of ε as received: `aeroloop.protocol.wire.attitude.received_quaternion`, as an expression. Shape (4,).
+    """q^Q of a received ε: `aeroloop.protocol.wire.attitude.received_quaternion`, as an expression. Shape (4,).
 
-    Args:
-        eps: ε. Shape (3,).
-        last: The previous q^Q; of ±q the nearer one is taken. Shape (4,).
+    Of ±q the one nearer to the previous q^Q is taken, `last`.
     """
     square = ca.dot(eps, eps)
     eta = ca.sqrt(ca.fmax(0, 1 - square))  # (C.11)
@@ -35,7 +33,7 @@ def tracking_errors(q: ca.SX, omega: ca.SX, q_d: ca.SX, omega_d: ca.SX) -> tuple
     return ca.vertcat(eta_e, eps_e), omega - R(q).T @ omega_d
 
 
-INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
+_INPUTS: Final = ("last", "state", "gains", "eps", "omega", "q_d", "omega_d", "omega_d_dot")
 
 
 def law_function(law: Law[Any]) -> ca.Function:
@@ -50,23 +48,23 @@ def law_function(law: Law[Any]) -> ca.Function:
     """
     states = {name: len(value) for name, value in initial_state(law).items()}
     gains = {name: len(value) for name, value in configured_gains(law).items()}
-    sizes = dict(zip(INPUTS, (4, sum(states.values()), sum(gains.values()), 3, 3, 4, 3, 3), strict=True))
+    sizes = dict(zip(_INPUTS, (4, sum(states.values()), sum(gains.values()), 3, 3, 4, 3, 3), strict=True))
     last, state, gain, eps, omega, q_d, omega_d, omega_d_dot = (ca.SX.sym(name, n) for name, n in sizes.items())
     q, e, omega_e = ca.SX.sym("q", 4), ca.SX.sym("e", 4), ca.SX.sym("omega_e", 3)
     attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
     errors = ca.Function(
         "errors", [q, omega, q_d, omega_d], list(tracking_errors(q, omega, q_d, omega_d)), {"cse": True}
     )
-    seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
     given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
     if isinstance(law, ExpressionLaw):
-        now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, split(gain, gains), split(state, states))
+        now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, _split(gain, gains), _split(state, states))
+        seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
         with naming(law.settings.kind, law.expressions):
-            answer = ca.Function("answer", seen, _expressions(law, now, states), {"cse": True})
+            answer = ca.Function("answer", seen, _answer(law, now, states), {"cse": True})
     else:
         of_law = ca.SX.sym("law_voltages", law.actuators), ca.SX.sym("law_state", sizes["state"])
         given |= dict(zip(("law_voltages", "law_state"), of_law, strict=True))
-    last, state, gain, eps, *motion = list(given.values())[: len(INPUTS)]
+    last, state, gain, eps, *motion = [given[name] for name in _INPUTS]
     with as_written():
         q = attitude(last, eps)
         e, omega_e = errors(q, *motion[:3])
@@ -81,25 +79,26 @@ def law_function(law: Law[Any]) -> ca.Function:
         )
 
 
-def _expressions(law: ExpressionLaw[Any], now: Now[ca.SX], states: Mapping[str, int]) -> list[ca.SX]:
-    """Voltages and next state of a law, each in one column; `states` are the sizes of its first state."""
+def _answer(law: ExpressionLaw[Any], now: Now[ca.SX], first: Mapping[str, int]) -> list[ca.SX]:
+    """Voltages and next state of a law, each in one column; `first` has the sizes of its first state."""
     answer = law.expressions(now)
     if not (isinstance(answer, tuple) and len(answer) == 2):
         raise TypeError("it gives one value, not two: the voltages, and the state after this tick, such as {}")
     u = ca.densify(ca.vec(ca.SX(answer[0])))
-    found = {name: ca.vec(ca.SX(value)) for name, value in answer[1].items()}
-    check_answer(law, u.numel(), {name: value.numel() for name, value in found.items()}, states)
-    return [u, ca.densify(ca.vertcat(ca.SX(0, 1), *(found[name] for name in states)))]
+    after = {name: ca.vec(ca.SX(value)) for name, value in answer[1].items()}
+    check_answer(law, u.numel(), {name: value.numel() for name, value in after.items()}, first)
+    return [u, ca.densify(ca.vertcat(ca.SX(0, 1), *(after[name] for name in first)))]
+
+
+def _split(column: ca.SX, sizes: Mapping[str, int]) -> dict[str, ca.SX]:
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    return {name: column[ends[i] : ends[i + 1]] for i, name in enumerate(sizes)}
 
 
 def check_answer(law: Law[Any], voltages: int, after: Mapping[str, int], first: Mapping[str, int]) -> None:
     """Raise ValueError if a law gives other than one voltage for each actuator, or another state than its first one.
 
-    Args:
-        law: The law.
-        voltages: How many it has given.
-        after: Sizes of the state that it has given, by name.
-        first: The same of its first state.
+    `after` and `first` have the sizes of both states, by name.
     """
     if voltages != law.actuators:
         raise ValueError(f"it gives {voltages} voltages for {law.actuators} actuators")
@@ -125,11 +124,3 @@ def initial_state(law: Law[Any]) -> dict[str, list[float]]:
     assert isinstance(law, ExpressionLaw)
     with naming(law.settings.kind, law.initial):
         return {name: list(map(float, values)) for name, values in law.initial().items()}
-
-
-def split(column: ca.SX, sizes: Mapping[str, int]) -> dict[str, ca.SX]:
-    """Consecutive parts of a column, by name."""
-    ends = [0]
-    for size in sizes.values():
-        ends.append(ends[-1] + size)
-    return {name: column[ends[i] : ends[i + 1]] for i, name in enumerate(sizes)}

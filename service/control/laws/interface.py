@@ -1,11 +1,8 @@
 """Law interface: settings, with the body that a law knows, and one tick, as CasADi expressions or as Python.
 
 Each tick the controller gives a law the attitude and rate as received, the desired motion and the errors between them,
-and takes voltages. What a law carries from tick to tick is its named state: it is in snapshots, telemetry and logs, so
-that a replay can begin anywhere. Gains are those of its settings that an operator may change while it runs.
-
-A law of expressions is one compiled function with decoding, reference and quantizers; experiments and readers of logs
-run it over thousands of ticks at once. A law in Python runs wherever the other does, tick by tick.
+and takes voltages. What a law carries from tick to tick is its named state, which telemetry and logs have, so that a
+replay can begin anywhere. Gains are those of its settings that an operator may change while it runs.
 """
 
 from __future__ import annotations
@@ -28,18 +25,15 @@ T = TypeVar("T", bound="LawSettings")
 
 MAX_GAIN: Final = 20.0
 """The largest gain: no typing error makes one a hundred times too large."""
-PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
-"""A gain that must act."""
 Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
-"""A gain that may be 0."""
 Gains3 = tuple[Gain, Gain, Gain]
 """One for each body axis: x, y, z."""
-
+PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
+MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
+"""The same of a gain that must act: the diagonal of a positive definite matrix."""
 Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 """The diagonal of a positive definite matrix."""
-MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
-"""The same of a gain."""
-Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
+_Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
 
 
 class LawSettings(BaseModel):
@@ -57,7 +51,7 @@ class LawSettings(BaseModel):
     centre_of_mass: Vector = Field(
         default=(0.0, 0.0, -0.0038), description="r_g, origin to centre of mass, body frame [m]"
     )
-    allocation: tuple[Row, Row, Row] = Field(
+    allocation: tuple[_Row, _Row, _Row] = Field(
         default=((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, -0.0014, 0.00176)),
         description="B, control allocation of rank 3, a column for each motor: voltages u turn the body with "
         "the torque +B u, body frame [N·m/V]; the Aero's first row and column are fictitious",
@@ -88,13 +82,12 @@ class Now(NamedTuple, Generic[X]):
         desired_attitude: q_d, relative to inertial [1]. Shape (4,).
         desired_rate: ω_d, *inertial* frame: R(q)ᵀω_d is in the body frame [rad/s]. Shape (3,).
         desired_acceleration: Its derivative, inertial frame [rad/s²]. Shape (3,).
-        attitude_error: e = q_d⁻¹ ∘ q, (C.16), the body relative to the desired frame: R(e) = R(q_d)ᵀR(q), and [1, 0, 0,
-            0] without error. A torque along −e[1:4] turns back the shorter way if e[0] ≥ 0; −e is the same attitude
-            [1]. Shape (4,).
+        attitude_error: e = q_d⁻¹ ∘ q, (C.16), the body relative to the desired frame: [1, 0, 0, 0] without error. A
+            torque along −e[1:4] turns back the shorter way if e[0] ≥ 0; −e is the same attitude [1]. Shape (4,).
         rate_error: ω − R(q)ᵀω_d, (C.18), *body* frame [rad/s]. Shape (3,).
-        gains: The present value of each of `Law.gains`, by name, which an operator may have changed: `Law.settings` has
-            the configured one. Shape (1,) for a number, else its length.
-        state: The named state after the last tick. Each in the shape that the law gave it.
+        gains: The present value of each of `Law.gains`, by name; `Law.settings` has the configured one. Shape (1,) for
+            a number, else its length.
+        state: The named state after the last tick.
     """
 
     attitude: X
@@ -114,20 +107,15 @@ class Law(ABC, Generic[T]):
     Args:
         settings: An instance of the class's `Settings`, as configured. A gain's present value is in `Now.gains`.
         period: Time between ticks [s].
-        actuators: Number of voltages to give.
-
-    Raises:
-        ValueError: These settings are no law for so many actuators; the text says why.
-
-    Attributes:
-        Settings: The model of its settings.
-        gains: Names of those settings that may change while it runs: numbers, or tuples of them.
-        units: Unit of each part of its named state, for tables and pages; 1 where none is given.
+        actuators: Number of voltages to give. A constructor raises ValueError if it is no law for so many.
     """
 
     Settings: ClassVar[type[LawSettings]]
+    """The model of its settings."""
     gains: ClassVar[tuple[str, ...]] = ()
+    """Names of those settings that may change while it runs: numbers, or tuples of them."""
     units: ClassVar[Mapping[str, str]] = {}
+    """Unit of each part of its named state, for tables and pages; 1 where none is given."""
 
     def __init__(self, settings: T, period: float, actuators: int) -> None:
         self.settings = settings
@@ -136,10 +124,9 @@ class Law(ABC, Generic[T]):
 
     @classmethod
     def certify(cls, configured: Any) -> Mapping[str, Any] | None:  # noqa: ARG003  # for those that override it
-        """What is proven of a configuration with this law: `holds` and `verdict`, with whatever else; None if nothing.
+        """What is proven with this law: `holds` and `verdict`, with whatever else; None if nothing.
 
-        Args:
-            configured: The whole configuration, with sections as in the TOML file.
+        `configured` is the whole configuration, with sections as in the TOML file.
         """
         return None
 
@@ -157,14 +144,10 @@ class ExpressionLaw(Law[T]):
 
 
 class PythonLaw(Law[T]):
-    """A law in plain Python. `step` runs once a tick, between a received frame and the sent one: it must not block.
-
-    Attributes:
-        state: All that it carries from tick to tick, by name. What is kept elsewhere is not in logs, so a replay that
-            begins in mid-session differs.
-    """
+    """A law in plain Python. `step` runs once a tick, between a received frame and the sent one: it must not block."""
 
     state: dict[str, Floats]
+    """All that it carries from tick to tick, by name. What is kept elsewhere is not in logs, and does not replay."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -191,15 +174,8 @@ def gravity_torque(p: LawSettings, q: X) -> X:
 def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
     """The voltages whose torque B u is this, the least ones if there are several [V]. Shape (actuators,).
 
-    A B of three columns serves two motors, too: they are its last two, and the first row is fictitious.
-
-    Args:
-        p: Has B.
-        torque: B u on the body, body frame: an expression, or numbers, which give an array [N·m]. Shape (3,).
-        actuators: Number of motors.
-
-    Raises:
-        ValueError: B has no inverse, or another number of columns.
+    A B of three columns serves two motors, too: they are its last two, and the first row is fictitious. Of an
+    expression it is one, of numbers an array. Raises ValueError if B has no inverse, or another number of columns.
     """
     B: Floats = check_allocation(p, actuators)
     if not isinstance(torque, ca.SX):

@@ -17,9 +17,8 @@ from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorque
 from aeroloop.service.control.laws.baselines import LQR, PD, PID, Nonadaptive, Sliding
 from aeroloop.service.control.laws.interface import Law, LawSettings
 
-GROUP: Final = "aeroloop.laws"
-_OWN: Final = "package.module:Class"
 _OURS: Final[tuple[type[Law[Any]], ...]] = Adaptive, Nonadaptive, PD, PID, AdaptiveTorque, Sliding, LQR
+_OWN: Final = "package.module:Class"
 
 
 class CustomLawSettings(LawSettings):
@@ -28,9 +27,9 @@ class CustomLawSettings(LawSettings):
     model_config = ConfigDict(extra="allow")
 
 
-MODELS: Final = {law.Settings.model_fields["kind"].default: law.Settings for law in _OURS} | {_OWN: CustomLawSettings}
+BUILT_IN: Final = {law.Settings.model_fields["kind"].default: f"{law.__module__}:{law.__name__}" for law in _OURS}
+MODELS: Final = dict(zip(BUILT_IN, (law.Settings for law in _OURS), strict=True)) | {_OWN: CustomLawSettings}
 """The model of each kind of `[law]`."""
-BUILT_IN: Final = {kind: f"{law.__module__}:{law.__name__}" for kind, law in zip(MODELS, _OURS, strict=False)}
 
 
 def _tag(section: Any) -> str:
@@ -54,48 +53,20 @@ class LawError(AeroloopError):
     """A law that cannot be used; one line with its name."""
 
 
-def law_settings(section: LawSettings) -> LawSettings:
-    """The settings as the law's own model has them, defaults included.
-
-    Raises:
-        PluginError: There is no such law.
-        LawError: The settings are wrong.
-    """
-    return _class_and_settings(section)[1]
-
-
 def law_class(section: LawSettings) -> type[Law[Any]]:
     """The class of the law that a section configures. Raises PluginError."""
-    return find("law.kind", section.kind, GROUP, BUILT_IN, Law)
+    return find("law.kind", section.kind, "aeroloop.laws", BUILT_IN, Law)
 
 
-def version_of(section: LawSettings) -> dict[str, str]:
-    """Which source a user's law is of, for descriptions; nothing of ours. Raises PluginError."""
-    return {} if section.kind in BUILT_IN else {f"law {section.kind}": source_of(law_class(section))}
-
-
-def gains_of(section: LawSettings) -> Gains:
-    """The configured gains. Raises as `law_settings`."""
-    law, settings = _class_and_settings(section)
-    return Gains.model_validate({name: getattr(settings, name) for name in law.gains})
-
-
-def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
-    """The settings with other gains; those not given stay.
-
-    Raises:
-        PluginError: There is no such law.
-        LawError: The law has no such gain, or it is out of its bounds; the text names all of its gains.
-    """
-    law, settings = _class_and_settings(section)
-    if unknown := [name for name in gains.named if name not in law.gains]:
-        known = ", ".join(law.gains) or "none that may change while it runs"
-        raise LawError(f"law {section.kind} has no gain {unknown[0]}; it has {known}")
-    numbers = {
-        name: isinstance(getattr(settings, name), int | float) and len(gain) == 1 for name, gain in gains.named.items()
-    }
-    changed = {name: gain[0] if numbers[name] else gain for name, gain in gains.named.items()}
-    return _valid(type(settings), settings.model_dump() | changed)
+def law_settings(section: LawSettings) -> LawSettings:
+    """The settings as the law's own model has them, defaults included. Raises PluginError, or LawError if wrong."""
+    law = law_class(section)
+    model = getattr(law, "Settings", None)
+    if not (isinstance(model, type) and issubclass(model, LawSettings)):
+        raise PluginError(
+            f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
+        )
+    return section if isinstance(section, model) else _valid(model, section.model_dump())
 
 
 def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
@@ -105,9 +76,46 @@ def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
         PluginError: There is no such law.
         LawError: The settings are wrong, or it is no law for so many actuators.
     """
-    law, settings = _class_and_settings(section)
+    law, settings = law_class(section), law_settings(section)
     with naming(section.kind, law):
         return law(settings, period, actuators)
+
+
+def version_of(section: LawSettings) -> dict[str, str]:
+    """Which source a user's law is of, for descriptions; nothing of ours. Raises PluginError."""
+    return {} if section.kind in BUILT_IN else {f"law {section.kind}": source_of(law_class(section))}
+
+
+def gains_of(section: LawSettings) -> Gains:
+    """The configured gains. Raises as `law_settings`."""
+    settings = law_settings(section)
+    return Gains.model_validate({name: getattr(settings, name) for name in law_class(section).gains})
+
+
+def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
+    """The settings with other gains; those not given stay.
+
+    Raises:
+        PluginError: There is no such law.
+        LawError: The law has no such gain, or it is out of its bounds; the text names all of its gains.
+    """
+    law, settings = law_class(section), law_settings(section)
+    if unknown := [name for name in gains.named if name not in law.gains]:
+        known = ", ".join(law.gains) or "none that may change while it runs"
+        raise LawError(f"law {section.kind} has no gain {unknown[0]}; it has {known}")
+    changed: dict[str, Any] = dict(gains.named)
+    for name, gain in gains.named.items():
+        if len(gain) == 1 and isinstance(getattr(settings, name), int | float):
+            changed[name] = gain[0]
+    return _valid(type(settings), settings.model_dump() | changed)
+
+
+def _valid(model: type[LawSettings], values: dict[str, Any]) -> LawSettings:
+    configuration: Any = create_model("Configuration", law=(model, ...))  # so that messages have the whole key
+    try:
+        return configuration.model_validate({"law": values}).law  # type: ignore[no-any-return]  # of `model`
+    except ValidationError as error:
+        raise LawError("; ".join(problems(error, configuration))) from None
 
 
 @contextmanager
@@ -124,23 +132,3 @@ def words_of(kind: str, error: Exception, called: Any) -> str:
     if kind in BUILT_IN:
         return str(error)
     return f"law {kind}: {exception_line(error, called)}"
-
-
-def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettings]:
-    law = law_class(section)
-    model = getattr(law, "Settings", None)
-    if not (isinstance(model, type) and issubclass(model, LawSettings)):
-        raise PluginError(
-            f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
-        )
-    if isinstance(section, model):
-        return law, section
-    return law, _valid(model, section.model_dump())
-
-
-def _valid(model: type[LawSettings], values: dict[str, Any]) -> LawSettings:
-    configuration: Any = create_model("Configuration", law=(model, ...))  # so that messages have the whole key
-    try:
-        return configuration.model_validate({"law": values}).law  # type: ignore[no-any-return]  # of `model`
-    except ValidationError as error:
-        raise LawError("; ".join(problems(error, configuration))) from None

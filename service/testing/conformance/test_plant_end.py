@@ -102,11 +102,10 @@ def test_an_operators_stop_acts_at_once(hil: Hil) -> None:
 
 
 def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
-    """A step of the reference that the motors cannot follow within the time allowed at the limit."""
+    """A reference whose rate the motors cannot reach within the time allowed at the limit."""
     step = {
-        "reference.kind": "hold",
-        "reference.attitude": [0, 0, 150],
-        "controller.start_within_deg": 360,  # jump, instead of going there smoothly
+        "reference.amplitude": [0, 0, 150],
+        "reference.frequency": [0, 0, 4],
         "plant.limits.max_saturated_s": 0.3,
     }
     hil.start(settings={**PATIENT, **step}, drive=False)

@@ -90,7 +90,7 @@ def seen(controller: Controller) -> str:
     state = [value for values in c.law_state.values() for value in values]
     vectors = c.attitude, c.rate, c.desired, state, c.attitude_error, c.rate_error
     counts = c.refused, c.invalid, c.fault is not None, c.saturated
-    return repr(([list(vector) for vector in vectors], c.voltages, counts))
+    return repr(([list(vector) for vector in vectors], list(c.voltages), counts))
 
 
 @st.composite

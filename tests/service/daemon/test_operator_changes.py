@@ -44,8 +44,6 @@ def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     assert (start.tick, start.gains) == (0, gains_with())
     assert change == Change(session="s0", tick=7, gains=given)
     assert loop.controller.gains == gains_with(C1=(1.0, 1.0, 1.0), Gamma=(0.5, 0.5, 0.5))
-    assert "none has changed" in loop.answered("set_gains", Gains()).text
-    assert loop.controller.gains == gains_with(C1=(1.0, 1.0, 1.0), Gamma=(0.5, 0.5, 0.5))
 
 
 @pytest.mark.parametrize("given", [Gains(), Gains(C1=LAW.C1), gains_with()])
@@ -61,16 +59,11 @@ def test_gains_that_change_nothing_are_answered_and_publish_no_event(loop: Loop,
         ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "law.C1[2]: should be less than or equal to 20"),
         ("set_gains", b'{"C9": [1, 1, 1]}', "no gain C9; it has C1, C2, Gamma"),
         ("set_gains", b'{"C1": [0.3, 0.0, 0.3]}', "law.C1[1]: should be greater than 0"),
-        ("set_gains", b'{"C2": [0.3, 0.3]}', "law.C2"),
-        ("set_gains", b'{"C2": 0.3}', "law.C2"),
-        ("set_gains", b'{"mass": 2}', "no gain mass"),
         ("set_gains", b"gains, please", "Gains"),
         ("track", b'{"reference": {"kind": "dance"}}', "Track"),
-        ("track", b"", "Track"),
         ("track", Track(reference=Hold(attitude=(0.0, 61.0, 0.0))), "max_reference_tilt_deg"),
         ("track", Track(reference=Hold(attitude=(1.0, 0.0, 0.0))), "roll"),
         ("track", Track(reference=yaw_of(90.0), within_s=0.5), "max_reference_rate"),
-        ("track", Track(reference=Sinusoid(frequency=(0.0, 3.0, 3.0))), "max_reference_rate"),
         ("track", Track(reference=LATER_TOO_FAST), "max_reference_rate"),
     ],
 )

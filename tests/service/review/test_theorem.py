@@ -138,9 +138,9 @@ def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_
 
 
 def test_an_error_larger_than_the_certificate_assumes_is_not_judged(tmp_path: Path) -> None:
-    """A session that begins 5° from its reference, with a certificate that assumes 1°."""
-    settings = lockstep("controller.start_within_deg=1", *CERTIFIED, "law.damping_bound=0.5")
-    settings = settings.model_copy(update={"reference": Hold(attitude=(0.0, 0.0, 5.0))})
+    """A session that begins 40° from its reference, with a certificate that assumes 20°."""
+    settings = lockstep(*CERTIFIED, "law.damping_bound=0.5")
+    settings = settings.model_copy(update={"reference": Hold(attitude=(0.0, 0.0, 40.0))})
     make_log(tmp_path / "a.mcap", 50, settings=settings, truth_every=1)
     findings, theorem = judged(tmp_path / "a.mcap")
     assert theorem.outside["Assumption 3"] == theorem.samples == 50

@@ -1,4 +1,4 @@
-"""Law with estimates of friction and torque: its Lyapunov inequality, the PID within it, and what it learns.
+"""Law with estimates of friction and torque: its Lyapunov inequality, and what it learns.
 
 Bodies, gains and motions are random, so that no term hides behind a zero or a symmetry. The body is written out here.
 """
@@ -13,7 +13,6 @@ import pytest
 from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
-from aeroloop.service.control.laws.baselines import PIDSettings
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_of
@@ -109,33 +108,6 @@ def test_the_lyapunov_function_falls_with_both_frictions_and_a_constant_torque(p
         assert promised <= bound < 0
         projected += slope < promised - 1e-6 * (1 + abs(promised))
     assert projected > 20 if pressed else projected == 0
-
-
-def test_the_pid_is_its_special_case_to_first_order() -> None:
-    """With the gains that the README maps, torques and integrals differ by the square of the errors only."""
-    rng = np.random.default_rng(2)
-    same = body(rng)
-    C1, C2, k1, Gamma = rng.uniform(0.2, 2, (4, 3))
-    still = {"Gamma_damping": (0, 0, 0), "Gamma_coulomb": (0, 0, 0), "torque_bound": (9, 9, 9)}
-    gains = {"C1": C1, "C2": C2, "k1": k1, "Gamma_torque": Gamma}
-    ours = Tick(AdaptiveTorqueSettings.model_validate(same | still | gains))
-    gains = {"kp": k1 + C1 * C2, "kd": C2 + same["inertia"] * C1 / 2, "ki": Gamma, "attitude_share": C1}
-    pid = Tick(PIDSettings.model_validate(same | gains))
-    q_d, way = unit(rng), rng.normal(size=(3, 3))
-    omega_d, omega_d_dot = rng.normal(size=(2, 3))
-
-    def apart(h: float) -> tuple[float, float]:
-        """Differences of torque and of the next Γ_d-fold integral, for errors of size h."""
-        eps, rate, integral = h * way
-        q = product(q_d, np.append(np.sqrt(1 - eps @ eps), eps))
-        motion = q, twin.rotation(q).T @ omega_d + rate, q_d, omega_d, omega_d_dot
-        torque, after = ours(np.array([1, *Gamma * integral, *ours.first[4:]]), *motion)
-        pids, theirs = pid(np.array([1, *integral]), *motion)
-        return np.abs(torque - pids).max(), np.abs(after[1:4] - Gamma * theirs[1:]).max()
-
-    far, near = apart(0.02), apart(0.01)
-    assert 0 < near[0] == pytest.approx(far[0] / 4, rel=0.1)
-    assert near[1] < 1e-15
 
 
 MODELLED = """

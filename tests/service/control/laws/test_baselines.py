@@ -6,7 +6,6 @@ Bodies, gains and motions are random, so that no term hides behind a zero or a s
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -15,8 +14,8 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from aeroloop.protocol.wire.attitude import IDENTITY
-from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gains, response_of, riccati, tuned
+from aeroloop.service.config import load, load_over
+from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gain, response_of, tuned
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
 from aeroloop.service.lab.experiment import experiment
@@ -55,8 +54,8 @@ class Body:
         self.p: Any = law_settings(section)
         law: Any = law_of(section, PERIOD, 3)
         self.function = law_function(law)
-        self.gains = [value for gain in configured_gains(law).values() for value in gain]
-        self.state = np.array([value for values in initial_state(law).values() for value in values])
+        self.gains, state = values_of(law)
+        self.state = np.array(state)
         self.J, self.B, self.theta = np.array(self.p.inertia), B, np.array(known["damping_estimate"])
 
     def law(self, q: Array, omega: Array, q_d: Array, omega_d: Array, omega_d_dot: Array, state: Array) -> Any:
@@ -77,14 +76,16 @@ class Body:
         return np.asarray(moment / self.J)
 
 
-def along(function: Callable[[Array], Array], x: Array, h: float) -> Array:
-    """A function's value at h x."""
-    return function(h * x)
-
-
 def slope_of(value: Any, h: float = 1e-6) -> Any:
     """Central difference of a function at 0."""
     return (value(h) - value(-h)) / (2 * h)
+
+
+def values_of(law: Any) -> tuple[list[float], list[float]]:
+    """Configured gains and first state of a law, each one below the other."""
+    return [x for gain in configured_gains(law).values() for x in gain], [
+        x for part in initial_state(law).values() for x in part
+    ]
 
 
 @pytest.mark.parametrize("kind", BASELINES)
@@ -92,8 +93,7 @@ def slope_of(value: Any, h: float = 1e-6) -> Any:
 def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, motors: int) -> None:
     law: Any = law_of(load(overrides=[f"law.kind={kind}"]).law, PERIOD, motors)
     q = np.array([np.sqrt(1 - 0.05), 0.0, 0.2, -0.1])
-    gains = [value for gain in configured_gains(law).values() for value in gain]
-    state = [value for values in initial_state(law).values() for value in values]
+    gains, state = values_of(law)
     still = dict.fromkeys(("omega", "omega_d", "omega_d_dot"), [0.0] * 3)
     for q_d in (q, -q):  # the same attitude
         found = law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=q_d, **still)
@@ -139,7 +139,7 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
             return np.array([x[1], body.omega_dot(q, omega, torque)[axis], *further])
 
         one_by_one = np.eye(2 + bool(extra))
-        A = np.column_stack([slope_of(partial(along, derivative, x)) for x in one_by_one])
+        A = np.column_stack([slope_of(lambda h, x=x: derivative(h * x)) for x in one_by_one])
         wn, zeta = response.bandwidth[axis], response.damping[axis]
         pair = np.roots([1, 2 * zeta * wn, wn**2])
         expected = POLES.get(kind, POLES["pd"])(wn, pair)
@@ -147,55 +147,37 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
         assert np.poly(A) == pytest.approx(np.poly(expected), rel=3 * wn * PERIOD if kind == "lqr" else 1e-4)
 
 
-def moving(body: Body, rng: np.random.Generator) -> tuple[Any, ...]:
-    """A random motion: the law's torque, and functions of time from it on: error quaternion, rate error."""
-    q, q_d, omega, omega_d, omega_d_dot = unit(rng), unit(rng), *rng.normal(size=(3, 3))
-    if product(q_d * [1, -1, -1, -1], q)[0] < 0:
-        q_d = -q_d
-    state = body.state.copy()
-    state[1:] = rng.normal(size=len(state) - 1)
-    torque, after = body.law(q, omega, q_d, omega_d, omega_d_dot, state)
-    omega_dot = body.omega_dot(q, omega, torque)
-
-    def at(t: float) -> tuple[Array, Array]:
-        turned = q + t / 2 * product(q, np.append(0, omega))
-        turned /= np.linalg.norm(turned)
-        desired = q_d + t / 2 * product(np.append(0, omega_d), q_d)
-        desired /= np.linalg.norm(desired)
-        e = product(desired * [1, -1, -1, -1], turned)
-        return e, omega + t * omega_dot - twin.rotation(turned).T @ (omega_d + t * omega_d_dot)
-
-    return at, state[1:], (after[1:] - state[1:]) / PERIOD
-
-
-def test_the_lyapunov_function_of_pd_falls_by_the_damping_alone() -> None:
+@pytest.mark.parametrize("kind", ["pd", "sliding"])
+def test_far_from_the_reference_the_error_moves_as_the_law_promises(kind: str) -> None:
+    """V of PD falls by the damping alone; the sliding law moves straight to its surface."""
     rng = np.random.default_rng(2)
-    body = Body("pd", rng, kp=(1.3, 1.3, 1.3), kd=(0.5, 0.9, 0.7))
+    body = Body(kind, rng, **({"kp": (1.3, 1.3, 1.3), "kd": (0.5, 0.9, 0.7)} if kind == "pd" else {}))
     for _ in range(5):
-        at, *_ = moving(body, rng)
+        q, q_d, omega, omega_d, omega_d_dot = unit(rng), unit(rng), *rng.normal(size=(3, 3))
+        if product(q_d * [1, -1, -1, -1], q)[0] < 0:
+            q_d = -q_d
+        torque, _ = body.law(q, omega, q_d, omega_d, omega_d_dot, body.state)
+        omega_dot = body.omega_dot(q, omega, torque)
 
-        def falling(t: float, at: Any = at) -> float:
-            e, omega_e = at(t)
-            return float(2 * 1.3 * (1 - e[0]) + omega_e @ (body.J * omega_e) / 2)
+        def at(t: float, motion: Any = (q, q_d, omega, omega_d, omega_dot, omega_d_dot)) -> tuple[Array, Array]:
+            """Error quaternion and rate error a little later."""
+            q, q_d, omega, omega_d, omega_dot, omega_d_dot = motion
+            turned, desired = (
+                q + t / 2 * product(q, np.append(0, omega)),
+                q_d + t / 2 * product(np.append(0, omega_d), q_d),
+            )
+            turned, desired = turned / np.linalg.norm(turned), desired / np.linalg.norm(desired)
+            rate_error = omega + t * omega_dot - twin.rotation(turned).T @ (omega_d + t * omega_d_dot)
+            return product(desired * [1, -1, -1, -1], turned), rate_error
 
-        omega_e = at(0)[1]
-        assert slope_of(falling) == pytest.approx(-omega_e @ (np.array(body.p.kd) * omega_e), rel=1e-6)
-
-
-def test_the_sliding_law_moves_straight_to_its_surface() -> None:
-    rng = np.random.default_rng(3)
-    body = Body("sliding", rng)
-    p = body.p
-    for _ in range(5):
-        at, *_ = moving(body, rng)
-
-        def sigma(t: float, at: Any = at) -> Array:
-            e, omega_e = at(t)
-            return np.asarray(omega_e + np.array(p.slope) * e[1:])
-
-        torque = -np.array(p.strength) * np.tanh(sigma(0) / np.array(p.layer))
-        assert body.J * slope_of(sigma) == pytest.approx(torque, rel=1e-6)
-        assert np.abs(torque).max() <= max(p.strength)
+        if kind == "pd":
+            falling = slope_of(lambda t, at=at: 2 * 1.3 * (1 - at(t)[0][0]) + at(t)[1] @ (body.J * at(t)[1]) / 2)
+            assert falling == pytest.approx(-at(0)[1] @ (np.array(body.p.kd) * at(0)[1]), rel=1e-6)
+        else:
+            slope, K, layer = (np.array(getattr(body.p, name)) for name in ("slope", "strength", "layer"))
+            sigma = at(0)[1] + slope * at(0)[0][1:]
+            towards = body.J * slope_of(lambda t, at=at, slope=slope: at(t)[1] + slope * at(t)[0][1:])
+            assert towards == pytest.approx(-K * np.tanh(sigma / layer), rel=1e-6)
 
 
 def test_the_other_equilibrium_is_approached_only_once_it_is_nearer_by_the_hysteresis() -> None:
@@ -209,8 +191,8 @@ def test_where_a_motor_saturates_the_integral_gives_way_and_else_it_does_not() -
     def held(reset_time: float) -> Array:
         """k_i e_I after an error of 30° that no command moves, for 20 s. Shape (3,)."""
         law: Any = law_of(load(overrides=["law.kind=pid", f"law.reset_time={[reset_time] * 3}"]).law, 0.02, 2)
-        function, gains = law_function(law), [value for gain in configured_gains(law).values() for value in gain]
-        state = ca.DM([value for values in initial_state(law).values() for value in values])
+        function, (gains, first) = law_function(law), values_of(law)
+        state = ca.DM(first)
         turned = {"omega": [0.0] * 3, "omega_d": [0.0] * 3, "omega_d_dot": [0.0] * 3, "q_d": IDENTITY}
         for _ in range(1000):
             answer = function(last=IDENTITY, state=state, gains=gains, eps=[0, 0.18, 0.18], **turned)
@@ -234,8 +216,7 @@ def test_without_adaptation_the_voltages_are_the_papers_with_its_first_estimate(
     q = np.abs(unit(rng))
     found = []
     for law in laws:
-        state = [value for values in initial_state(law).values() for value in values]
-        gains = [value for gain in configured_gains(law).values() for value in gain]
+        gains, state = values_of(law)
         found.append(law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=q, **motion))
     assert np.array(found[0]["u"]).tolist() == np.array(found[1]["u"]).tolist()
     assert laws[1].initial().keys() == {"sign"}
@@ -253,7 +234,8 @@ BODY = (
 @pytest.mark.parametrize("kind", BASELINES)
 @pytest.mark.parametrize("plant", ["aero", "full turns of a free body"])
 def test_without_quantization_the_ideal_plant_follows_the_reference(kind: str, plant: str) -> None:
-    settings = ideal(kind, () if plant == "aero" else BODY)
+    settings = load(overrides=[f"law.kind={kind}", "plant.ideal=true", *(() if plant == "aero" else BODY)])
+    settings = settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
     found = experiment(settings, 30.0)
     assert found.compiled
     # the Aero's damping is not the estimated one, and its motors push its fixed joint; the free body's is exact
@@ -263,17 +245,8 @@ def test_without_quantization_the_ideal_plant_follows_the_reference(kind: str, p
     assert found.figures.z_track < 4.5e-4
 
 
-def ideal(kind: str, overrides: tuple[str, ...]) -> Settings:
-    settings = load(overrides=[f"law.kind={kind}", "plant.ideal=true", *overrides])
-    return settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
-
-
 def test_the_regulators_gains_are_optimal() -> None:
-    rng = np.random.default_rng(6)
-    A, F, Q = rng.normal(size=(4, 4)), rng.normal(size=(4, 2)), np.diag(rng.uniform(0.1, 1, 4))
-    assert riccati(A, F @ F.T, Q) == pytest.approx(solve_discrete_are(A, F, Q, np.eye(2)), rel=1e-9)
     J, T, weights = 0.7, 0.05, (2.0, 0.3)
-    [gain, *_] = optimal_gains((J, 1.0, 1.0), (weights[0], 1.0, 1.0), (weights[1], 0.0, 0.0), T)
     A, B = np.array([[1, T], [0, 1]]), np.array([[T * T / 2 / J], [T / J]])
     X = solve_discrete_are(A, B, np.diag(weights), np.eye(1))
-    assert gain == pytest.approx((np.linalg.solve(1 + B.T @ X @ B, B.T @ X @ A))[0])
+    assert optimal_gain(J, *weights, T) == pytest.approx((np.linalg.solve(1 + B.T @ X @ B, B.T @ X @ A))[0])

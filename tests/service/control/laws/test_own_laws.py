@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from math import isnan
 from pathlib import Path
@@ -20,7 +20,6 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.interface import gravity_torque, voltages_for
-from aeroloop.service.lab.experiment import experiment, run_experiment
 from tests.service.control.test_tick import frames
 from tests.support import failing_laws
 from tests.support.failing_laws import FAILING, Failure
@@ -30,24 +29,15 @@ PERIOD = 0.002
 CONTINUOUS = WireSpec(actuators=3).with_bits("cont/cont")
 
 
-def configured(kind: str, *overrides: str) -> Settings:
-    return load(overrides=[f"law.kind={kind}", *overrides])
-
-
-def controller(kind: str, *overrides: str, wire: WireSpec = CONTINUOUS) -> Controller:
-    return Controller(wire, configured(kind, *overrides).law, Sinusoid(), PERIOD)
-
-
-def still(wire: WireSpec, k: int) -> bytes:
-    """The measurement of tick k: at rest and level."""
-    codes = [signal.quantizer().encode(0.0) for signal in (wire.attitude, wire.rate) for _ in range(3)]
-    return wire.measurement.pack(k % wire.measurement.counters, codes)
+def controller(kind: str, *overrides: str, wire: WireSpec = CONTINUOUS, still: bool = False) -> Controller:
+    law = load(overrides=[f"law.kind={kind}", *overrides]).law
+    return Controller(wire, law, Hold(attitude=(0.0, 0.0, 0.0)) if still else Sinusoid(), PERIOD)
 
 
 @pytest.mark.parametrize("kind", [EXPRESSIONS, PYTHON])
 def test_a_law_gets_what_is_received_and_gives_what_is_sent(kind: str) -> None:
     """A body that has yawed, by hand: e = (cos, 0, 0, sin) of half the angle, and the rate is that of the body."""
-    one = Controller(CONTINUOUS, configured(kind, "law.kp=10", "law.ki=4").law, Hold(attitude=(0.0, 0.0, 0.0)), PERIOD)
+    one = controller(kind, "law.kp=10", "law.ki=4", still=True)
     half, rate = 0.1, (0.01, -0.02, 0.03)
     codes = [*(CONTINUOUS.attitude.quantizer().encode(x) for x in (0.0, 0.0, np.sin(half)))]
     codes += [CONTINUOUS.rate.quantizer().encode(x) for x in rate]
@@ -60,7 +50,7 @@ def test_a_law_gets_what_is_received_and_gives_what_is_sent(kind: str) -> None:
         assert frame is not None
         read = CONTINUOUS.command.unpack(frame)
         assert read is not None
-        assert (read[0], list(read[1])) == (k, one.voltages)
+        assert read == (k, one.voltages)
     assert one.law_state == {"sum": (0.0, 0.0, pytest.approx(sums)), "sign": (1.0,)}
 
 
@@ -101,26 +91,6 @@ def test_a_state_that_is_not_the_laws_is_not_taken() -> None:
     assert one.law_state == {"sum": (0.0, 0.0, 0.0), "sign": (-1.0,)}
 
 
-# Experiments
-
-
-@pytest.mark.parametrize("kind", [EXPRESSIONS, f"{HERE}:Bare"])
-def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_frames(kind: str) -> None:
-    own = configured(kind)
-    found = experiment(own, 3.0)
-    commands: list[bytes] = []
-    assert found.figures == run_experiment(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
-    assert found.compiled
-    assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
-    assert np.abs(found.course.voltages).max() > 1
-
-
-def _codes(own: Settings, frame: bytes) -> Sequence[float]:
-    read = own.wire.command.unpack(frame)
-    assert read is not None
-    return tuple(read[1])
-
-
 # Laws that fail
 
 WHY = {
@@ -139,7 +109,7 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     line = 1 + next(i for i, text in enumerate(lines) if "raise RuntimeError" in text)
     one = controller(f"{FAILING}:Failing", f"law.failure={failure}")
     for k in range(6):
-        frame = one.tick(still(CONTINUOUS, k), k)
+        frame = one.tick(CONTINUOUS.measurement.pack(k, [0.0] * 6), k)
         assert frame is not None
         read = CONTINUOUS.command.unpack(frame)
         assert read is not None

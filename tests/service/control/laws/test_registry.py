@@ -39,20 +39,8 @@ def test_a_users_law_has_its_own_settings_checked_by_its_own_model() -> None:
     assert type(found) is Expressions
     assert (found.settings.kp, found.settings.kd, found.settings.mass) == (7.0, (5.0, 6.0, 7.0), 2.0)
     assert gains_of(found.settings) == Gains(kp=7, kd=(5, 6, 7), ki=3)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "why"),
-    [
-        (["law.kpp=1"], "did you mean law.kp"),
-        (["law.kp=-1"], "law.kp"),
-        (["law.kp=20.5"], "law.kp"),
-        (["law.kd=[1, 2]"], "law.kd"),
-        (["law.C1=[1, 1, 1]"], "law.C1"),
-    ],
-)
-def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list[str], why: str) -> None:
-    assert why in refused(EXPRESSIONS, *overrides)
+    for override, key in (("kpp=1", "did you mean law.kp"), ("kp=20.5", "law.kp"), ("kd=[1, 2]", "law.kd")):
+        assert key in refused(EXPRESSIONS, f"law.{override}")
 
 
 @pytest.mark.parametrize(
@@ -61,11 +49,8 @@ def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list
         ("adaptve", "law.kind = 'adaptve' is not known: it is one of adaptive, "),
         (f"{HERE}:Pd", f"{HERE} has no Pd; its classes of aeroloop.Law are Expressions, "),
         (f"{FAILING}:NoLaw", "does not derive from aeroloop.Law"),
-        (f"{FAILING}:not_even_a_class", "does not derive from aeroloop.Law"),
         (f"{FAILING}:NoSettings", "has no Settings that derive from aeroloop.LawSettings (failing_laws.py, line "),
         (f"{HERE}:", "does not name a class"),
-        (":PD", "does not name a class"),
-        ("tests.support.their_laws:PD", "there is no module tests.support.their_laws here"),
         ("their_lab.laws:PD", "there is no module their_lab here; install it, or add its folder to PYTHONPATH"),
         (f"{FAILING}:Picky", f"law {FAILING}:Picky: ValueError: flies with eight motors only (failing_laws.py, line "),
     ],
@@ -106,29 +91,20 @@ def test_a_first_mistake_in_expressions_is_one_line_with_class_file_and_line(mis
 def test_gains_are_bounded_by_the_law_and_it_has_no_others() -> None:
     section = load(overrides=[f"law.kind={PYTHON}"]).law
     assert gains_of(with_gains(section, Gains(kp=0, kd=None))) == Gains(kp=0, kd=(5, 6, 7), ki=3)
-    for gains, why in (
-        (Gains(kq=1), "has no gain kq; it has kp, kd, ki"),
-        (Gains(mass=1), "has no gain mass"),
-        (Gains(kp=21), "law.kp"),
-        (Gains(kp=(1, 1)), "law.kp"),
-        (Gains(kd=1), "law.kd"),
-        (Gains(kd=(1, 1, -1)), "law.kd"),
+    paper, bare = load().law, load(overrides=[f"law.kind={HERE}:Bare"]).law
+    for law, gains, why in (
+        (section, Gains(kq=1), "has no gain kq; it has kp, kd, ki"),
+        (section, Gains(mass=1), "has no gain mass"),
+        (section, Gains(kp=21), r"law\.kp"),
+        (section, Gains(kp=(1, 1)), r"law\.kp"),
+        (section, Gains(kd=1), r"law\.kd"),
+        (section, Gains(kd=(1, 1, -1)), r"law\.kd"),
+        (bare, Gains(kp=1), "none that may change while it runs"),
+        (paper, Gains(C1=(0.3, 0.0, 0.3)), r"law\.C1\[1\]: should be greater than 0"),
+        (paper, Gains(Gamma=(20.001, 1.0, 1.0)), r"law\.Gamma\[0\]: should be less than or equal to 20"),
     ):
         with pytest.raises(LawError, match=why):
-            with_gains(section, gains)
-    with pytest.raises(LawError, match="none that may change while it runs"):
-        with_gains(load(overrides=[f"law.kind={HERE}:Bare"]).law, Gains(kp=1))
-    paper = load().law
-    for name, diagonal, why in (
-        ("C1", (0.3, 0.0, 0.3), r"law\.C1\[1\]: should be greater than 0"),
-        ("C2", (0.3, 0.3, -1e-9), r"law\.C2\[2\]: should be greater than 0"),
-        ("Gamma", (20.001, 1.0, 1.0), r"law\.Gamma\[0\]: should be less than or equal to 20"),
-    ):
-        with pytest.raises(LawError, match=why):
-            with_gains(paper, Gains.model_validate({name: diagonal}))
-
-
-# Where classes are found
+            with_gains(law, gains)
 
 
 def test_an_entry_point_of_the_group_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
