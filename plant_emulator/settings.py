@@ -5,7 +5,6 @@ This is the only module that selects the parts of a plant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -14,63 +13,44 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from aeroloop.plant_emulator.endpoint.endpoint import LimitMonitor, LimitSettings
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings, Mechanism, RotorSettings
-from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
+from aeroloop.plant_emulator.model.bodies import AeroSettings, Mechanism, RigidBodySettings, aero, rigid_body
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings, RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
 from aeroloop.protocol.wire.spec import WATCHDOG_S
 
 Sign: TypeAlias = Literal[-1, 1]
-
-CardType: TypeAlias = Literal["quanser_aero2_usb", "quanser_aero_usb"]
-
-_PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_aero_usb": 2048}
+Channel: TypeAlias = Literal[-3, -2, -1, 1, 2, 3]
 
 
 class QuanserSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """The board, and how its channels map to the body. Verify the signs and the gyro's axes on the bench."""
 
-    card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name")
-    card_identifier: str = Field(
-        default="0", min_length=1, description="which board; a virtual one is '0@tcpip://localhost:18950'"
+    card_type: Literal["quanser_aero2_usb", "quanser_aero_usb"] = Field(
+        default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name"
     )
+    card_identifier: str = Field(default="0", min_length=1, description="which board")
     rate: Literal["derivative", "gyro"] = Field(
         default="derivative", description="derivative: of the encoders' angles, filtered"
     )
-    pitch_counts: int | None = Field(
-        default=None, gt=0, description="pitch encoder's counts a turn; if left out, the card type's (2880, 2048)"
-    )
-    yaw_counts: int = Field(default=4096, gt=0, description="yaw encoder's counts a turn")
-    encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
     bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
-    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter [1]")
-    gyro_axes: tuple[int, int, int] = Field(
-        default=(0, 1, 2), description="which of the gyro's channels 0, 1, 2 measures the body's x, y, z"
-    )
-    gyro_signs: tuple[Sign, Sign, Sign] = Field(default=(1, 1, 1), description="of the body's x, y, z")
-    gyro_scale: float = Field(default=1.0, gt=0, description="angular velocity at a gyro reading of 1 [rad/s]")
-    motor_channels: tuple[int, int] = Field(default=(0, 1), description="analog outputs of u2 and u3")
+    encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
     motor_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of u2 and u3")
+    gyro_channels: tuple[Channel, Channel, Channel] = Field(
+        default=(1, 2, 3),
+        description="which of the gyro's channels 1, 2, 3 measures the body's x, y, z; negative where it is reversed",
+    )
     voltage_limit: float = Field(
         default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 recommended, 24 maximum"
     )
-    board_watchdog_s: float = Field(
-        default=0.1, gt=0, le=10, description="the board's watchdog sets 0 V after this long without a good sample [s]"
-    )
 
-    @field_validator("gyro_axes", "motor_channels")
+    @field_validator("gyro_channels")
     @classmethod
     def _each_channel_once(cls, channels: tuple[int, ...]) -> tuple[int, ...]:
-        if sorted(channels) != list(range(len(channels))):
-            raise ValueError(f"must name each of 0…{len(channels) - 1} once")
+        if len({abs(channel) for channel in channels}) < len(channels):
+            raise ValueError("must name each of 1, 2, 3 once")
         return channels
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Encoder counts a turn, pitch and yaw."""
-        return self.pitch_counts or _PITCH_COUNTS[self.card_type], self.yaw_counts
 
 
 class PlantSettings(BaseModel, extra="forbid"):
@@ -90,11 +70,6 @@ class PlantSettings(BaseModel, extra="forbid"):
     own: dict[str, Any] = Field(
         default={}, description="settings of a plant that is neither aero nor rigid_body: those of its class"
     )
-    ideal: bool = Field(
-        default=False,
-        description="the paper's equations and nothing else: Table C.1, damping θ = [0, 0.0071, 0.0220] about the body "
-        "axes, no rotor lag, no friction, no wind, perfect sensors",
-    )
     armed_at_start: bool = Field(
         default=True,
         description="grant the first claim without `op arm`, unless a process before this one left a trip or a stop",
@@ -107,12 +82,8 @@ class PlantSettings(BaseModel, extra="forbid"):
     watchdog_s: float = Field(
         default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
     )
-    answer_timeout_s: float = Field(
-        default=2.0, gt=0, le=600, description="lockstep only: 0 V after waiting this long for an answer [s]"
-    )
     truth_rate_hz: float = Field(default=10.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
-    substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period of an emulated body")
     faults: list[str] = Field(
         default=[],
         max_length=MAX_FAULTS,
@@ -125,10 +96,7 @@ class PlantSettings(BaseModel, extra="forbid"):
     limits: LimitSettings = Field(default=LimitSettings(), description="beyond any of these the plant trips")
     aero: AeroSettings = Field(default=AeroSettings(), description="body of the Aero, for kind = 'aero'")
     rigid_body: RigidBodySettings = Field(default=RigidBodySettings(), description="free body, for kind = 'rigid_body'")
-    quanser: QuanserSettings = Field(
-        default=QuanserSettings(),
-        description="Quanser's board, for via = 'quanser'",
-    )
+    quanser: QuanserSettings = Field(default=QuanserSettings(), description="Quanser's board, for via = 'quanser'")
     rotor: RotorSettings = Field(
         default=RotorSettings(), description="lag and dead zone; lags of 0 leave the rotors out"
     )
@@ -161,20 +129,12 @@ class PlantSettings(BaseModel, extra="forbid"):
     @model_validator(mode="after")
     def _sensors_fit_the_body(self) -> PlantSettings:
         needs_joints = self.sensors.attitude == "encoders" or self.sensors.rate == "derivative"
-        if self.kind == "rigid_body" and needs_joints and not self.ideal:
+        if self.kind == "rigid_body" and needs_joints:
             raise ValueError(
                 "a free body has no joints for encoders: set sensors.attitude to 'perfect' and sensors.rate to 'gyro' "
-                "or 'perfect', or set ideal"
+                "or 'perfect'"
             )
         return self
-
-    @property
-    def effective(self) -> PlantSettings:
-        """These settings with `ideal` replaced by the parts that it stands for."""
-        if not self.ideal:
-            return self
-        parts = {"aero": IDEAL_AERO, "rotor": IDEAL_ROTOR, "friction": IDEAL_FRICTION, "sensors": IDEAL_SENSORS}
-        return self.model_copy(update={**parts, "wind": WindSettings(), "ideal": False})
 
     @property
     def emulated(self) -> bool:
@@ -184,16 +144,16 @@ class PlantSettings(BaseModel, extra="forbid"):
     @property
     def actuators(self) -> int | None:
         """Number of motors of an emulated body; None for any other plant, whose class knows."""
-        return {"aero": Aero.actuators, "rigid_body": RigidBody.actuators}.get(self.kind)
+        return {"aero": 2, "rigid_body": 3}.get(self.kind)
 
     def mechanism(self) -> Mechanism:
-        """The emulated body, of `effective` settings. Raises PlantError for any other plant."""
+        """The emulated body. Raises PlantError for any other plant."""
         if not self.emulated:
             raise PlantError(
                 f"this needs a plant whose equations are known, plant.kind = {' or '.join(map(repr, EMULATED))}, "
                 f"and it is {self.kind!r}"
             )
-        return RigidBody(self.rigid_body) if self.kind == "rigid_body" else Aero(self.aero)
+        return rigid_body(self.rigid_body) if self.kind == "rigid_body" else aero(self.aero)
 
     def make(self, period: float) -> Plant:
         """Make the plant of this kind; `advance` lets one `period` pass [s].
@@ -206,17 +166,15 @@ class PlantSettings(BaseModel, extra="forbid"):
 
     def build(self, period: float) -> EmulatedPlant:
         """Build the emulated plant; `advance` integrates one `period` [s]. Raises PlantError for any other kind."""
-        parts = self.effective
-        mechanism = parts.mechanism()
+        mechanism = self.mechanism()
         return EmulatedPlant(
             mechanism,
-            parts.rotor,
-            parts.friction,
-            Wind(parts.wind, mechanism.axes, period),
-            Sensors(parts.sensors, period),
+            self.rotor,
+            self.friction,
+            Wind(self.wind, mechanism.axes, period),
+            Sensors(self.sensors, period),
             period=period,
             voltage_limit=self.voltage_limit,
-            substeps=self.substeps,
         )
 
     def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
@@ -230,10 +188,5 @@ class PlantSettings(BaseModel, extra="forbid"):
         return LimitMonitor(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
 
 
-_OF_EMULATED = ("ideal", "substeps", "aero", "rigid_body", "rotor", "friction", "wind", "sensors")
+_OF_EMULATED: Final = ("aero", "rigid_body", "rotor", "friction", "wind", "sensors")
 """Settings that act on an emulated body only."""
-
-IDEAL_AERO = AeroSettings(centre_of_mass=(0.0, 0.0, -0.0038), damping=(0.0, 0.0071, 0.0220))
-IDEAL_ROTOR = RotorSettings(lag_up_s=0.0, lag_down_s=0.0)
-IDEAL_FRICTION = FrictionSettings(viscous=(), coulomb=())
-IDEAL_SENSORS = SensorSettings(attitude="perfect", rate="perfect")

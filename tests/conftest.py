@@ -17,7 +17,7 @@ settings.load_profile("untimed")
 _STATES: Final = TemporaryDirectory(prefix="aeroloop-tests-")
 _SIGNALS: Final = signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
-PROCESSES: Final = ("tests/hil/", "tests/can/test_buses.py", "tests/can/test_socketcan.py", "testing/conformance/")
+PROCESSES: Final = ("tests/hil/", "tests/can/test_buses.py", "testing/conformance/")
 """Where every test starts processes, and is one of real time unless it is marked `smoke`; elsewhere a test says so."""
 
 

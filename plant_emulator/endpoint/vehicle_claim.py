@@ -115,9 +115,7 @@ class VehicleClaim:
     """
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
-        self.wire = wire
-        self.period_ns = period_ns
-        self.lockstep = lockstep
+        self.wire, self.period_ns, self.lockstep = wire, period_ns, lockstep
         self.session: str | None = None
         self.holder: str | None = None
         self.trip: TripCause | None = None

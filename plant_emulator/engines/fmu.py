@@ -1,20 +1,18 @@
 """FMU as a plant: a model that Simulink, OpenModelica, Dymola or another tool exported for co-simulation, FMI 2 or 3.
 
-FMPy loads it. Once a period the voltages are set, the FMU advances by the period in equal communication steps, and the
-outputs that the settings name are read. What they give is both the true state and what the sensors measure. Whatever is
-wrong with a file, a variable or a start value is one line, and a failure of the FMU one line in its own words.
+FMPy loads it. Once a period the voltages are set, the FMU advances by the period, and the outputs that the settings
+name are read. What they give is both the true state and what the sensors measure. Whatever is wrong with a file or a
+variable is one line, and a failure of the FMU one line in its own words.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import chdir, suppress
-from difflib import get_close_matches
-from math import cos, isclose, prod, radians, sin
+from math import cos, radians, sin
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final
 from zipfile import ZipFile
 
 from pydantic import BaseModel, Field, model_validator
@@ -35,7 +33,7 @@ class FmuError(PluginError):
 
 
 class FmuSettings(BaseModel, extra="forbid", frozen=True):
-    """Which FMU, and its variables by name; `q[2]` is an element of an array too, counted from 1."""
+    """Which FMU, and its variables by name. Angles and rates that it declares in degrees are converted."""
 
     file: Path = Field(description="the FMU, of FMI 2 or 3, exported for co-simulation")
     voltages: list[Name] = Field(
@@ -46,17 +44,14 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
     )
     angles: Names3 | None = Field(
         default=None,
-        description="outputs with roll, pitch and yaw [angle_unit]: yaw about z, then pitch, then roll; '' is 0 always",
+        description="outputs with roll, pitch and yaw [rad]: yaw about z, then pitch, then roll; '' is 0 always",
     )
     rate: tuple[Name, Name, Name] | None = Field(
-        default=None, description="outputs with the angular velocity in the body frame [rate_unit]; or set angle_rates"
+        default=None, description="outputs with the angular velocity in the body frame [rad/s]; or set angle_rates"
     )
     angle_rates: Names3 | None = Field(
-        default=None, description="outputs with the derivatives of roll, pitch and yaw [rate_unit]; '' is 0 always"
+        default=None, description="outputs with the derivatives of roll, pitch and yaw [rad/s]; '' is 0 always"
     )
-    angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of angles")
-    rate_unit: Literal["rad/s", "deg/s"] = Field(default="rad/s", description="unit of rate and angle_rates")
-    substeps: int = Field(default=1, ge=1, le=100, description="communication steps of the FMU a period")
     start: dict[str, bool | int | float | str | list[float]] = Field(
         default={}, description="start values and parameters, by the FMU's names, in the FMU's units"
     )
@@ -73,14 +68,6 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
             raise ValueError("voltages must name each input once")
         return self
 
-    @property
-    def outputs(self) -> dict[str, str]:
-        """Names of the variables that are read, each with the unit that it must have."""
-        attitude = dict.fromkeys(self.quaternion or self.angles or (), self.angle_unit if self.angles else "1")
-        return {name: unit for name, unit in attitude.items() if name} | {
-            name: self.rate_unit for name in self.rate or self.angle_rates or () if name
-        }
-
 
 class FmuPlant(Plant):
     """A co-simulation FMU as a plant, stepped `period` by `period` [s].
@@ -93,55 +80,42 @@ class FmuPlant(Plant):
     repeatable: ClassVar[bool] = True  # a simulation; of one that is not, a replay finds the first tick that differs
 
     def __init__(self, settings: FmuSettings, period: float) -> None:
-        self._settings, self._name, self._step = settings, settings.file.name, period / settings.substeps
-        self.actuators = len(settings.voltages)
-        self._steps = 0
-        self._description = description = _description(settings.file)
-        self._fmi2 = description.fmiMajorVersion == 2
-        self._variables: Mapping[str, Any] = {each.name: each for each in description.modelVariables}
-        fixed = float(description.coSimulation.fixedInternalStepSize or 0)  # of FMI 3
-        if fixed and not (round(self._step / fixed) and isclose(self._step / fixed, round(self._step / fixed))):
-            raise FmuError(
-                f"{self._name} has steps of {fixed:g} s, of which {self._step:g} s, the loop's period or its part by "
-                "plant.own.substeps, is no multiple: set loop.rate_hz, or export the FMU with another step"
-            )
-        inputs = [self._element(name, ("input",), "V") for name in settings.voltages]
-        self._outputs = {
-            name: self._element(name, ("output", "local"), unit) for name, unit in settings.outputs.items()
-        }
-        self._logged = (-1, "")  # status and text of the gravest message; of those the last
+        self._settings, self._name, self._period = settings, settings.file.name, period
+        self._description = _description(settings.file)
+        self._fmi2 = self._description.fmiMajorVersion == 2
+        self._inputs = [self._reference(name, "input")[0] for name in settings.voltages]
+        outputs = [*(settings.quaternion or settings.angles or ()), *(settings.rate or settings.angle_rates or ())]
+        self._outputs = {name: self._reference(name, "output", "local") for name in outputs if name}
+        self.actuators = len(self._inputs)
+        self._voltages = [0.0] * self.actuators
+        self._periods = 0
+        self._words = ""  # of its last message that is more than a remark
         self._fmu: Any = None
         self._fatal = False
         self._folder = TemporaryDirectory(prefix="aeroloop-fmu-")
         try:
-            self._load()
+            self._start()
+            self._sample()
         except BaseException:
             self.close()
             raise
-        self._given = {variable.name: self._read(variable) for variable, _ in inputs}
-        self._voltages = [(self._given[variable.name], index) for variable, index in inputs]
-        self.actuate((0.0,) * self.actuators)
-        self._sample()
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V] from the next period on. Shape (actuators,)."""
-        for (values, index), voltage in zip(self._voltages, voltages, strict=True):
-            values[index] = voltage
+        self._voltages = [float(voltage) for voltage in voltages]
 
     def advance(self) -> None:
         """Advance the FMU by one period."""
+        time = self._periods * self._period
         try:
-            for name, values in self._given.items():
-                write = self._fmu.setReal if self._fmi2 else self._fmu.setFloat64
-                write([self._variables[name].valueReference], values)
-            for _ in range(self._settings.substeps):
-                ended = self._fmu.doStep(self._steps * self._step, self._step)
-                self._steps += 1
-                if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
-                    raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._own_words()}")
+            (self._fmu.setReal if self._fmi2 else self._fmu.setFloat64)(self._inputs, self._voltages)
+            ended = self._fmu.doStep(time, self._period)
+            if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
+                raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._words}")
+            self._periods += 1
             self._sample()
         except Exception as error:
-            raise self._failure(f"it failed at {self._steps * self._step:g} s", error) from None
+            raise self._failure(f"it failed at {time:g} s", error) from None
 
     def measure(self) -> Measurement:
         """The FMU's outputs at the end of the last period."""
@@ -149,7 +123,7 @@ class FmuPlant(Plant):
 
     def truth(self) -> State:
         """The same, with the voltages."""
-        return State(*self._measurement, tuple(values[index] for values, index in self._voltages))
+        return State(*self._measurement, tuple(self._voltages))
 
     def close(self) -> None:
         """End and free the FMU, and remove its unpacked files. A second call does nothing."""
@@ -160,119 +134,66 @@ class FmuPlant(Plant):
         self._fmu = None
         self._folder.cleanup()
 
-    def _read(self, variable: Any) -> list[float]:
-        """All elements of a variable."""
-        reference = [variable.valueReference]
-        values: list[float] = (
-            self._fmu.getReal(reference) if self._fmi2 else self._fmu.getFloat64(reference, prod(variable.shape))
-        )
-        return values
-
-    def _sample(self) -> None:
-        settings = self._settings
-        of = {name: self._read(variable)[index] for name, (variable, index) in self._outputs.items()} | {"": 0.0}
-        angles = _in_radians([of[name] for name in settings.angles or ()], settings.angle_unit)
-        a, b, c = _in_radians([of[name] for name in settings.rate or settings.angle_rates or ()], settings.rate_unit)
-        if settings.quaternion:
-            w, x, y, z = (of[name] for name in settings.quaternion)
-            attitude: Quaternion = (w, x, y, z)
-        else:
-            attitude = quaternion_of(*angles)
-        rate = body_rate((angles[0], angles[1]), (a, b, c)) if settings.angle_rates else (a, b, c)
-        self._measurement = Measurement(attitude, rate)
-
-    # ── checks and start ──
-
-    def _element(self, name: str, causalities: Sequence[str], unit: str) -> tuple[Any, int]:
-        """Variable and index that a name stands for; `q[2]` may be an element of an array, counted from 1.
-
-        It must have one of these causalities, the first being the usual one, and not be declared in another unit, if
-        that is one of an angle or its rate.
-        """
-        array = re.fullmatch(r"(.+)\[(\d+)\]", name)
-        index = 0
-        if name not in self._variables and array and array[1] in self._variables:
-            name, index = array[1], int(array[2]) - 1
+    def _reference(self, name: str, *causalities: str) -> tuple[int, float]:
+        """Value reference of a real scalar of one of these causalities, and its unit in rad, rad/s or its own."""
         real = "Real" if self._fmi2 else "Float64"
-        fitting = [
-            each for each, known in self._variables.items() if known.causality == causalities[0] and known.type == real
-        ]
-        variable = self._known(name, fitting)
-        if variable.causality not in causalities or variable.type != real:
-            raise FmuError(
-                f"{self._name}: {name} is {_kind(variable)}, not an {causalities[0]} of type {real}; "
-                f"of those it has {_listed(fitting)}"
-            )
-        size = prod(variable.shape)
-        if not 0 <= index < size:
-            raise FmuError(f"{self._name}: {name} has {size} elements, and none is {name}[{index + 1}]")
-        declared = variable.unit or getattr(variable.declaredType, "unit", None)
-        if declared != unit and {declared, unit} <= {"rad", "deg", "rad/s", "deg/s"}:
-            raise FmuError(f"{self._name}: {name} is in {declared}, not in {unit}: set angle_unit or rate_unit")
-        return variable, index
+        fitting = {
+            each.name: each
+            for each in self._description.modelVariables
+            if each.causality in causalities and each.type == real and not each.shape
+        }
+        if name not in fitting:
+            listed = ", ".join(list(fitting)[:8]) + (f" and {len(fitting) - 8} more" if len(fitting) > 8 else "")
+            raise FmuError(f"{self._name} has no {causalities[0]} {name} of type {real}; it has {listed or 'none'}")
+        variable = fitting[name]
+        unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
+        return variable.valueReference, radians(1) if unit.startswith("deg") else 1.0
 
-    def _load(self) -> None:
+    def _start(self) -> None:
         """Unpack, load and initialize it with the start values and parameters."""
         import fmpy
+        from fmpy.simulation import apply_start_values, settable_in_initialization_mode, settable_in_instantiated
 
-        for name in self._settings.start:
-            self._known(name, self._variables)
         try:
             fmpy.extract(self._settings.file, self._folder.name)
             with chdir("."):  # FMPy changes the folder to load the library, and does not return where that fails
                 self._fmu = fmpy.instantiate_fmu(self._folder.name, self._description, "CoSimulation", logger=self._log)
             if self._fmi2:
                 self._fmu.setupExperiment(startTime=0.0)
-            left = self._apply(self._settings.start, fmpy.simulation.settable_in_instantiated)
+            unset = apply_start_values(self._fmu, self._description, self._settings.start, settable_in_instantiated)
             self._fmu.enterInitializationMode()
-            for name in self._apply(left, fmpy.simulation.settable_in_initialization_mode):
-                kind = _kind(self._variables[name])
-                raise FmuError(f"{self._name}: plant.own.start.{name} cannot be set: it is {kind}")
+            unset = apply_start_values(self._fmu, self._description, unset, settable_in_initialization_mode)
+            if unset:
+                raise FmuError(f"{self._name} has no parameter or start value {', '.join(unset)}: see plant.own.start")
             self._fmu.exitInitializationMode()
         except Exception as error:
             raise self._failure("it does not start", error) from None
 
-    def _apply(self, start: Mapping[str, object], when: object) -> dict[str, object]:
-        """Set the start values that may be set now; returns the others."""
-        from fmpy.simulation import apply_start_values
-
-        left: dict[str, object] = {}
-        for name, value in start.items():
-            try:
-                left |= apply_start_values(self._fmu, self._description, {name: value}, when)
-            except (TypeError, ValueError) as error:
-                raise FmuError(f"{self._name}: plant.own.start.{name}: {error}") from None
-        return left
-
-    def _known(self, name: str, fitting: Iterable[str]) -> Any:
-        if name not in self._variables:
-            names = {each.lower(): each for each in fitting}
-            alike = get_close_matches(name.lower(), names, 1)
-            hint = f": did you mean {names[alike[0]]}?" if alike else f"; it has {_listed(fitting)}"
-            raise FmuError(f"{self._name} has no variable {name}{hint}")
-        return self._variables[name]
-
-    # ── failures ──
+    def _sample(self) -> None:
+        read, settings = (self._fmu.getReal if self._fmi2 else self._fmu.getFloat64), self._settings
+        values = read([reference for reference, _ in self._outputs.values()])
+        of = {name: value * scale for (name, (_, scale)), value in zip(self._outputs.items(), values, strict=True)}
+        of[""] = 0.0
+        roll, pitch, yaw = (of[name] for name in settings.angles or ("", "", ""))
+        a, b, c = (of[name] for name in settings.rate or settings.angle_rates or ("", "", ""))
+        attitude = quaternion_of(roll, pitch, yaw)
+        if settings.quaternion:
+            w, x, y, z = (of[name] for name in settings.quaternion)
+            attitude = w, x, y, z
+        self._measurement = Measurement(attitude, (a, b, c) if settings.rate else body_rate((roll, pitch), (a, b, c)))
 
     def _log(self, *message: Any) -> None:
         """Keep a message of the FMU. FMI 2 gives the FMU's name, too, before these three."""
         status, _, text = message[-3:]
-        if status >= self._logged[0]:
-            self._logged = (status, " ".join((text or b"").decode(errors="replace").split()))
-
-    def _own_words(self) -> str:
-        return f": {self._logged[1]}" if self._logged[1] else ""
+        if status and text:
+            self._words = ": " + " ".join(text.decode(errors="replace").split())
 
     def _failure(self, what: str, error: Exception) -> FmuError:
         if isinstance(error, FmuError):
             return error
         self._fatal |= getattr(error, "status", None) == _FATAL
         text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        preferred = float(getattr(self._description.defaultExperiment, "stepSize", None) or self._step)
-        hint = ""
-        if not isclose(preferred, self._step):
-            hint = f" (steps are of {self._step:g} s, and it prefers {preferred:g} s: see plant.own.substeps)"
-        return FmuError(f"{self._name}: {what}: {text}{self._own_words()}{hint}")
+        return FmuError(f"{self._name}: {what}: {text}{self._words}")
 
 
 def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -299,10 +220,6 @@ def body_rate(angles: tuple[float, float], derivatives: Vector) -> Vector:
     )
 
 
-def _in_radians(values: list[float], unit: str) -> list[float]:
-    return [radians(value) for value in values] if unit.startswith("deg") else values
-
-
 def _description(file: Path) -> Any:
     """The FMU's model description, if it can be used here."""
     try:
@@ -319,24 +236,9 @@ def _description(file: Path) -> Any:
         version = description.fmiMajorVersion
     except Exception as error:
         raise FmuError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
-    if version not in (2, 3):
-        raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for FMI 2 or 3")
-    if description.coSimulation is None:
-        raise FmuError(f"{file.name} is for model exchange only: export it for co-simulation")
+    if version not in (2, 3) or description.coSimulation is None:
+        raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for co-simulation by FMI 2 or 3")
     platform = fmpy.platform if version == 2 else fmpy.platform_tuple
-    library = f"binaries/{platform}/{description.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
-    if library not in files:
-        remedy = "export it on this platform, or `fmpy compile` it from its sources, if it has any"
-        raise FmuError(f"{file.name} has no binary for {platform}: {remedy}")
+    if not any(name.startswith(f"binaries/{platform}/") for name in files):
+        raise FmuError(f"{file.name} has no binary for {platform}: export it on this platform, or `fmpy compile` it")
     return description
-
-
-def _kind(variable: Any) -> str:
-    """Causality and type in words."""
-    cause = variable.causality or "local"
-    return f"{'an' if cause[0] in 'aeiou' else 'a'} {cause} of type {variable.type}"
-
-
-def _listed(names: Iterable[str]) -> str:
-    some = list(names)
-    return ", ".join(some[:8]) + (f" and {len(some) - 8} more" if len(some) > 8 else "") or "none"

@@ -44,12 +44,6 @@ class MujocoSettings(BaseModel, extra="forbid"):
     rotor: RotorSettings = Field(
         default=RotorSettings(lag_up_s=0.0, lag_down_s=0.0), description="lag and dead zone; by default neither"
     )
-    substeps: int | None = Field(
-        default=None,
-        ge=1,
-        le=1000,
-        description="steps of MuJoCo a period; if left out, the fewest no longer than the model's timestep",
-    )
     sensors: SensorSettings = Field(
         default=SensorSettings(attitude="perfect", rate="perfect"), description="sensors of attitude and rate"
     )
@@ -74,10 +68,8 @@ class MujocoPlant(Plant):
         except ModuleNotFoundError:
             raise PluginError("this needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
         self._model = model = self._loaded(settings.model)
-        model.opt.disableflags |= (
-            self._mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        )  # a state that is not finite is to be seen
-        self._substeps = settings.substeps or max(1, ceil(period / model.opt.timestep - 1e-9))
+        model.opt.disableflags |= self._mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a state that is not finite is seen
+        self._substeps = max(1, ceil(period / model.opt.timestep - 1e-9))
         model.opt.timestep = period / self._substeps
 
         self._data = data = self._mujoco.MjData(model)
@@ -104,16 +96,12 @@ class MujocoPlant(Plant):
     def advance(self) -> None:
         """Step through one period and sample the sensors."""
         step, model, data = self._mujoco.mj_step, self._model, self._data
-        if self._rotor.present:
-            half = model.opt.timestep / 2
-            for _ in range(self._substeps):
-                self._lag(half)
-                self._control(self._at_rotors)  # held over the step: its value in the middle
-                step(model, data)
-                self._lag(half)
-        else:
-            self._control(self._commanded)
-            step(model, data, self._substeps)
+        half = model.opt.timestep / 2
+        for _ in range(self._substeps):
+            self._lag(half)
+            self._control(self._at_rotors)  # held over the step: its value in the middle
+            step(model, data)
+            self._lag(half)
         self._sense()
 
     def measure(self) -> Measurement:
@@ -169,6 +157,9 @@ class MujocoPlant(Plant):
         self._ctrl[:] = self._at_rest + self._allocation.dot(voltages)
 
     def _lag(self, time: float) -> None:
+        if not self._rotor.present:
+            self._at_rotors = self._commanded
+            return
         pairs = zip(self._at_rotors, self._commanded, strict=True)
         self._at_rotors = [lagged(self._rotor, voltage, command, time) for voltage, command in pairs]
 

@@ -10,14 +10,14 @@ start time. So the ticks of its begin and end follow from the fault and the tick
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
-from math import ceil, inf
+from math import ceil, cos, hypot, inf, nan, sin
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FaultError, ValueFault
+from aeroloop.plant_emulator.faults.language import BY_CHANCE, SIGNALS, Fault, FaultError
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import FaultStatus
 
@@ -28,6 +28,7 @@ GARBLED_RATE: Final = 10.0
 """Bound of a garbled angular velocity about each axis, ± [rad/s]."""
 
 Source: TypeAlias = Literal["configured", "injected"]
+Values: TypeAlias = tuple[float, ...]
 
 
 class FaultTransition(NamedTuple):
@@ -37,46 +38,179 @@ class FaultTransition(NamedTuple):
     text: str
 
 
-class ScheduledFault:
-    """A fault with the ticks at which it begins and ends, in periods since the plant's time began; None for no end."""
-
-    def __init__(self, acting: ActingFault, source: Source, period: float) -> None:
-        self.acting, self.source = acting, source
-        self.begin = first_tick(acting.start, period)
-        self.end = None if acting.end == inf else first_tick(acting.end, period)
-        self.begun = False
-        self.over = self.begin == self.end  # it lies between two ticks
-
-    def transitions(self, now: int) -> list[FaultTransition]:
-        """Its begin and end up to tick `now`, unless returned before."""
-        found, fault = [], f"({self.source}): {self.acting.fault}"
-        if not (self.begun or self.over) and self.begin <= now:
-            self.begun = True
-            found.append(FaultTransition(self.begin, f"fault begins {fault}"))
-        if self.begun and not self.over and self.end is not None and self.end <= now:
-            self.over = True
-            text = f"fault ends {fault}, {self.acting.changed} {self.acting.fault.effect}"
-            found.append(FaultTransition(self.end, text))
-        return found
-
-    def status(self, first: int | None) -> FaultStatus:
-        """Its status; `first` is the plant's tick at which its time began, None if it has not."""
-        return FaultStatus(
-            fault=str(self.acting.fault),
-            source=self.source,
-            begin_tick=None if first is None else first + self.begin,
-            end_tick=None if first is None or self.end is None else first + self.end,
-            changed=self.acting.changed,
-            effect=self.acting.fault.effect,
-        )
-
-
 def first_tick(time_s: float, period: float) -> int:
     """The first tick at or after a time [s]. Tick n is at n·period, rounded to the nanosecond."""
     tick = max(0, ceil(time_s / period) - 1)
     while round(tick * period, 9) < time_s:
         tick += 1
     return tick
+
+
+class ActingFault:
+    """A fault in the plant's time, injected at the time `now` [s].
+
+    `last` is what its signal was just before: its values, or the frame that passed last; None if there were none.
+    Garbled values are within ±`bound`, in their unit.
+
+    Attributes:
+        begin, end: Ticks at which it begins and ends; infinity for no end.
+        begun, over: Whether `transitions` has returned its begin and its end; also over if between two ticks.
+        changed: Samples, voltages of a period, or frames that it has changed.
+        held: Frames held back, each with a time [s].
+    """
+
+    def __init__(
+        self,
+        fault: Fault,
+        source: Source,
+        random: np.random.Generator,
+        period: float,
+        now: float,
+        last: Any,
+        bound: float = 0.0,
+    ) -> None:
+        self.fault, self.source, self.kind, self.value = fault, source, fault.kind, fault.value or 0.0
+        self.begin = first_tick(round(fault.start_s + now, 9), period)
+        self.end = inf if fault.end_s is None else first_tick(round(fault.end_s + now, 9), period)
+        self.begun, self.over = False, self.begin == self.end
+        self.changed = 0
+        self.held: deque[tuple[float, bytes]] = deque()
+        self._random, self._last, self._bound = random, last, bound
+        self._whole, part = fault.target.whole, fault.target.part
+        self._size = len(last) if self._whole == "motors" else 3  # components of an error
+        self._parts = range(self._size) if part is None else (part,)
+        self._earlier: deque[tuple[float, Values]] = deque([] if last is None else [(-inf, last)])  # for a delay
+
+    def active(self, tick: int) -> bool:
+        """Whether it is at work at a tick."""
+        return self.begin <= tick < self.end
+
+    def acts(self, tick: int) -> bool:
+        """Whether it changes one sample or frame at a tick, which is counted; where by chance, chance decides."""
+        acts = self.active(tick) and (self.kind not in BY_CHANCE or bool(self._random.random() < self.value))
+        self.changed += acts
+        return acts
+
+    def transitions(self, now: int) -> list[FaultTransition]:
+        """Its begin and end up to tick `now`, unless returned before."""
+        found, fault = [], f"({self.source}): {self.fault}"
+        if not (self.begun or self.over) and self.begin <= now:
+            self.begun = True
+            found.append(FaultTransition(self.begin, f"fault begins {fault}"))
+        if self.begun and not self.over and self.end <= now:
+            self.over = True
+            found.append(FaultTransition(int(self.end), f"fault ends {fault}, {self.changed} {self.fault.effect}"))
+        return found
+
+    def status(self, first: int | None) -> FaultStatus:
+        """Its status; `first` is the plant's tick at which its time began, None if it has not."""
+        return FaultStatus(
+            fault=str(self.fault),
+            source=self.source,
+            begin_tick=None if first is None else first + self.begin,
+            end_tick=None if first is None or self.end == inf else first + int(self.end),
+            changed=self.changed,
+            effect=self.fault.effect,
+        )
+
+    # ── values ──
+
+    def values(self, given: Values, tick: int, t: float) -> Values:
+        """The values of a tick, at the time t [s]. Call it at every sample: before the fault starts, it keeps them."""
+        if self.kind == "delay":
+            self._earlier.append((t, given))
+            while len(self._earlier) > 1 and self._earlier[1][0] <= round(t - self.value, 9):
+                self._earlier.popleft()
+        if not self.active(tick):
+            self._last = given
+            return given
+        if not self.acts(tick):
+            return given
+        match self.kind:
+            case "off" | "drop":
+                # Without one axis a rate is invalid, so a sensor has no value about any.
+                return self._replaced(given, (0.0,) * self._size) if self._whole == "motors" else (nan,) * len(given)
+            case "stuck":
+                self._last = given if self._last is None else self._last
+                return self._replaced(given, self._last)
+            case "bias":
+                return self._shifted(given, [self.value] * self._size)
+            case "noise":
+                return self._shifted(given, (self.value * self._random.standard_normal(self._size)).tolist())
+            case "delay":
+                return self._replaced(given, self._earlier[0][1])
+        if self._whole != "attitude":
+            return self._replaced(given, tuple(self._random.uniform(-self._bound, self._bound, self._size).tolist()))
+        q = self._random.standard_normal(4).tolist()  # evenly distributed, once it has unit length
+        return tuple(part / hypot(*q) for part in q)
+
+    def _replaced(self, values: Values, by: Values) -> Values:
+        """The values with the fault's parts replaced by others; an attitude is replaced as a whole."""
+        if self._whole == "attitude":
+            return by
+        return tuple(by[i] if i in self._parts else value for i, value in enumerate(values))
+
+    def _shifted(self, values: Values, error: Sequence[float]) -> Values:
+        """The values with the fault's parts of an error added: of an attitude, a rotation about the body's axes."""
+        error = [part if i in self._parts else 0.0 for i, part in enumerate(error)]
+        if self._whole == "attitude":
+            return _rotated(values, error)
+        return tuple(value + part for value, part in zip(values, error, strict=True))
+
+    # ── frames ──
+
+    def frames(self, given: list[bytes], tick: int, t: float) -> list[bytes]:
+        """The frames that pass at a tick, at the time t [s], in order, of those given and those held back."""
+        passed: list[bytes] = []
+        match self.kind:
+            case "off" | "drop":
+                return [frame for frame in given if not self.acts(tick)]
+            case "duplicate":
+                again = [frame for _, frame in self.held]
+                self.held = deque((t, frame) for frame in given if self.acts(tick))
+                return again + given
+            case "delay":  # when it ends, all held frames pass at once, ahead of the newer ones
+                active = self.active(tick)
+                self.changed += active * len(given)
+                self.held.extend((round(t + self.value, 9), frame) for frame in given)
+                while self.held and (not active or self.held[0][0] <= t):
+                    passed.append(self.held.popleft()[1])
+                return passed
+        for frame in given:
+            if self.kind == "garble":
+                passed.append(self._garbled(frame) if frame and self.acts(tick) else frame)
+            elif self.kind == "stuck":
+                if not self.acts(tick) or self._last is None:
+                    self._last = frame
+                passed.append(self._last)
+            elif self.held:  # reorder
+                passed += [frame, self.held.popleft()[1]]
+            elif self.acts(tick):
+                self.held.append((t, frame))
+            else:
+                passed.append(frame)
+        return passed
+
+    def _garbled(self, frame: bytes) -> bytes:
+        bit = int(self._random.integers(8 * len(frame)))
+        garbled = bytearray(frame)
+        garbled[bit // 8] ^= 0x80 >> bit % 8
+        return bytes(garbled)
+
+
+def _rotated(q: Values, error: Sequence[float]) -> Values:
+    """`q ⊗ exp(error / 2)`; the error is a rotation vector in the body frame [rad]."""
+    angle = hypot(*error)
+    if angle == 0.0:
+        return q
+    scale = sin(angle / 2) / angle
+    (w, x, y, z), (a, b, c), d = q, (scale * part for part in error), cos(angle / 2)
+    return (
+        w * d - x * a - y * b - z * c,
+        w * a + x * d + y * c - z * b,
+        w * b - x * c + y * d + z * a,
+        w * c + x * b - y * a + z * d,
+    )
 
 
 class FaultyPlant(Plant):
@@ -101,7 +235,7 @@ class FaultyPlant(Plant):
         self._seen: Measurement | None = None
         self._last_frame: dict[str, bytes] = {}
         self._injected: Counter[str] = Counter()
-        self._scheduled: list[ScheduledFault] = []
+        self._known: list[ActingFault] = []  # in the order of injection, those that are over included
         self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in SIGNALS.values()}
 
     @property
@@ -132,36 +266,37 @@ class FaultyPlant(Plant):
             if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
                 there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
                 raise FaultError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
-        staying = 0 if clear else sum(not each.over for each in self._scheduled)
+        staying = 0 if clear else sum(not each.over for each in self._known)
         if staying + len(faults) > MAX_FAULTS:
             raise FaultError(f"a plant takes {MAX_FAULTS} faults at a time: `aeroloop op inject --clear` removes them")
         ends = self._clear() if clear else []
-        over = [each for each in self._scheduled if each.over]
+        over = [each for each in self._known if each.over]
         forgotten = over[: max(0, len(over) + len(faults) - MAX_FAULTS)]
-        self._scheduled = [each for each in self._scheduled if each not in forgotten]
+        self._known = [each for each in self._known if each not in forgotten]
         for fault in faults:
-            acting = self._at_work(fault)
+            acting = self._at_work(fault, source)
             self._acting[fault.target.whole].append(acting)
-            self._scheduled.append(ScheduledFault(acting, source, self._period))
+            self._known.append(acting)
         return ends
 
-    def _at_work(self, fault: Fault) -> ActingFault:
+    def _at_work(self, fault: Fault, source: Source) -> ActingFault:
         whole, seen = fault.target.whole, self._seen
         of_frames = whole in ("measurement", "command")
         number = self._injected[whole] if of_frames else self._injected.total()
         self._injected[whole] += 1
         # The signal's name is part of the seed, so that the two streams do not lose the same ticks.
         random = np.random.default_rng([self._seed, number, *fault.signal.encode()])
+        last: Any = seen and (seen.attitude if whole == "attitude" else seen.rate)
+        bound = GARBLED_RATE
         if of_frames:
-            return ActingFault(fault, random, self.time, self._last_frame.get(whole))
-        if whole == "motors":
-            return ValueFault(fault, random, self.time, self._applied, self._limit)
-        last = seen and (seen.attitude if whole == "attitude" else seen.rate)
-        return ValueFault(fault, random, self.time, last, GARBLED_RATE)
+            last = self._last_frame.get(whole)
+        elif whole == "motors":
+            last, bound = self._applied, self._limit
+        return ActingFault(fault, source, random, self._period, self.time, last, bound)
 
     def _clear(self) -> list[FaultTransition]:
-        self._scheduled = [each for each in self._scheduled if each.begun]
-        for each in self._scheduled:
+        self._known = [each for each in self._known if each.begun]
+        for each in self._known:
             if not each.over:
                 each.end = self.ticks
         self._stop_acting()
@@ -176,12 +311,12 @@ class FaultyPlant(Plant):
 
     def transitions(self) -> list[FaultTransition]:
         """Begins and ends up to now that were not returned before, in order of time."""
-        found = [transition for each in self._scheduled for transition in each.transitions(self.ticks)]
+        found = [transition for each in self._known for transition in each.transitions(self.ticks)]
         return sorted(found, key=lambda transition: transition.tick)
 
     def statuses(self, first: int | None) -> list[FaultStatus]:
         """Status of every fault in order; `first` is the plant's tick at `start`, None if there was none."""
-        return [each.status(first) for each in self._scheduled]
+        return [each.status(first) for each in self._known]
 
     # ── sensors and motors ──
 
@@ -189,7 +324,7 @@ class FaultyPlant(Plant):
         """Put voltages [V] through the motor faults on the motors. Shape (actuators,)."""
         self._commanded = tuple(voltages)
         self._actuated = True
-        self._applied = self._through("motors", self._commanded)
+        self._applied = self._values("motors", self._commanded)
         self.plant.actuate(self._applied)
 
     def advance(self) -> None:
@@ -209,8 +344,8 @@ class FaultyPlant(Plant):
         """Sensor values with their faults; the same until the next `advance`."""
         if self._seen is None:
             attitude, rate = self.plant.measure()
-            w, x, y, z = self._through("attitude", attitude)
-            a, b, c = self._through("rate", rate)
+            w, x, y, z = self._values("attitude", attitude)
+            a, b, c = self._values("rate", rate)
             self._seen = Measurement((w, x, y, z), (a, b, c))
         return self._seen
 
@@ -220,11 +355,24 @@ class FaultyPlant(Plant):
         self._commanded = self._applied = (0.0,) * self.actuators
         self.plant.close()
 
+    def _values(self, whole: str, given: Values) -> Values:
+        """Values after the faults of a signal, one after another."""
+        if faults := self._acting[whole]:
+            t = self.time if self.ticks >= 0 else -inf
+            for fault in faults:
+                given = fault.values(given, self.ticks, t)
+            faults[:] = [fault for fault in faults if self.ticks < fault.end]
+        return given
+
     # ── frames ──
 
     def passes(self, stream: Literal["measurement", "command"], frame: bytes | None) -> list[bytes]:
         """Pass the frame of a tick, if any, through the stream's faults. Returns the frames that pass now, in order."""
-        frames: list[bytes] = self._through(stream, [] if frame is None else [frame])
+        frames = [] if frame is None else [frame]
+        if faults := self._acting[stream]:
+            for fault in faults:
+                frames = fault.frames(frames, self.ticks, self.time if self.ticks >= 0 else -inf)
+            faults[:] = [fault for fault in faults if self.ticks < fault.end or fault.held]
         if frames:
             self._last_frame[stream] = frames[-1]
         return frames
@@ -233,12 +381,3 @@ class FaultyPlant(Plant):
         """Drop the frames held back: they belong to the last session's keys."""
         for fault in (*self._acting["measurement"], *self._acting["command"]):
             fault.held.clear()
-
-    def _through(self, whole: str, given: Any) -> Any:
-        """Values or frames after the faults of a signal, one after another."""
-        if faults := self._acting[whole]:
-            t = self.time if self.ticks >= 0 else -inf
-            for fault in faults:
-                given = fault.apply(given, t)
-            faults[:] = [fault for fault in faults if t < fault.end or fault.held]
-        return given

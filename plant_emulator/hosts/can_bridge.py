@@ -110,9 +110,7 @@ class Bridge:
     def __init__(
         self, role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, bus: CanSettings
     ) -> None:
-        self._role = role
-        self._loop = loop
-        self._node = bus.node
+        self._role, self._loop, self._node = role, loop, f"node {bus.node}"
         self._relay = Relay(
             wire, loop.period_ns, lockstep=loop.lockstep, watchdog_s=settings.watchdog_s, armed=settings.armed_at_start
         )
@@ -127,7 +125,7 @@ class Bridge:
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
         network, relay, bus = self._network, self._relay, self._bus
-        machine_notes = [] if self._loop.lockstep else prepare_process(self._loop)
+        network.notes = machine = [] if self._loop.lockstep else prepare_process(self._loop)
         network.serve()
         try:
             while not self._role.stop.is_set():
@@ -141,9 +139,8 @@ class Bridge:
                     self._account(None, now_ns)
                 self._watch_node()
                 self._follow_state()
-                failed = bus.errors or bus.refused
-                count = [f"the bus: {bus.errors} errors, {bus.refused} malformed frames"] if failed else []
-                network.notes = machine_notes + count
+                if bus.errors or bus.refused:
+                    network.notes = [*machine, f"the bus: {bus.errors} errors, {bus.refused} malformed frames"]
                 network.follow_session()
                 collect_garbage()
         finally:
@@ -158,12 +155,14 @@ class Bridge:
         return self._bus.pending or (link is not None and link.pending)
 
     def _pass_frames(self) -> None:
+        network, link = self._network, self._network.link
         arrival = self._bus.take()
-        if arrival is not None and self._relay.measurement(arrival.frame) is not None:
+        if arrival is not None and link is not None and self._relay.measurement(arrival.frame) is not None:
             sent_ns = time.monotonic_ns()
-            self._network.send(arrival.frame)
+            link.send(arrival.frame)
+            network.sent += arrival.frame != UNCHANGED
             self._account(arrival.frame, sent_ns)
-        arrival = self._network.link.take() if self._network.link else None
+        arrival = link.take() if link is not None else None
         if arrival is not None:
             self._arrival = arrival
             frame = self._relay.command(arrival.frame, time.monotonic_ns())
@@ -176,34 +175,28 @@ class Bridge:
 
     def _watch_node(self) -> None:
         """Trip when the bus fails, or the node is silent, tripped, restarted or of another wire spec."""
-        relay, bus, node = self._relay, self._bus, f"node {self._node}"
+        relay, bus, node, peer = self._relay, self._bus, self._node, self._bus.peer
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
             self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
             if bus.mend():
                 self._role.event("changed", "the bus is open again")
-        elif relay.session is None or bus.peer is None:
-            pass
-        elif bus.silent:
+        elif relay.session is not None and peer is not None and bus.silent:
             relay.expire(TripCause.NODE, f"{node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
-        elif bus.peer.at_ns < self._granted_ns:
-            pass  # this heartbeat may be from before the session
-        elif bus.peer.fingerprint != self._fingerprint:
-            relay.expire(TripCause.NODE, f"{node} has another wire spec now")
-        elif bus.peer.state is PlantState.IDLE:
-            relay.expire(TripCause.NODE, f"{node} was started again")
-        elif bus.peer.state is PlantState.TRIPPED:
-            cause = bus.peer.cause
-            relay.expire(cause or TripCause.NODE, f"{node} tripped: {cause or 'no cause reported'}")
+        elif relay.session is not None and peer is not None and peer.at_ns >= self._granted_ns:
+            if peer.fingerprint != self._fingerprint:
+                relay.expire(TripCause.NODE, f"{node} has another wire spec now")
+            elif peer.state is PlantState.IDLE:
+                relay.expire(TripCause.NODE, f"{node} was started again")
+            elif peer.state is PlantState.TRIPPED:
+                relay.expire(peer.cause or TripCause.NODE, f"{node} tripped: {peer.cause or 'no cause reported'}")
 
     def _unavailable(self) -> str | None:
         bus = self._bus
-        if bus.fault is not None:
-            return bus.fault
-        if bus.peer is None or bus.silent:
-            return f"node {self._node} is silent on the bus"
+        if bus.fault is not None or bus.peer is None or bus.silent:
+            return bus.fault or f"{self._node} is silent on the bus"
         if bus.peer.fingerprint != self._fingerprint:
-            return f"node {self._node} has another wire spec, period or lockstep setting than the bridge"
+            return f"{self._node} has another wire spec, period or lockstep setting than the bridge"
         return None
 
     def _follow_state(self) -> None:

@@ -32,9 +32,7 @@ class CanNetwork(PlantNetwork):
 
     def __init__(self, settings: CanSettings, loop: LoopSettings, endpoint: Endpoint) -> None:
         super().__init__()
-        self._settings = settings
-        self._loop = loop
-        self._endpoint = endpoint
+        self._settings, self._loop, self._endpoint = settings, loop, endpoint
         self._bus = CanLink(settings, endpoint.wire, "plant", lockstep=loop.lockstep)
         self._fingerprint = fingerprint(endpoint.wire, loop.period_ns, lockstep=loop.lockstep)
         self._number: int | None = None  # of the session
@@ -69,11 +67,6 @@ class CanNetwork(PlantNetwork):
                 self._begin(peer)
         self.follow_session()
 
-    def send(self, frame: bytes) -> None:
-        """Send a measurement frame; UNCHANGED only in lockstep."""
-        if frame or self._loop.lockstep:
-            self._bus.send(frame)
-
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """As `follow_session`. The bridge writes the trace."""
         del measurement, arrival, sent_ns
@@ -86,6 +79,11 @@ class CanNetwork(PlantNetwork):
             self._log(*notice)
         endpoint.notices.clear()
         endpoint.changes.clear()  # they belong to the trace
+        self.publish_status()
+
+    def publish_status(self) -> None:
+        """Send a heartbeat that is due, or that says something new."""
+        endpoint = self._endpoint
         cause = endpoint.trip.number if endpoint.trip else 0
         self._bus.beat_when_due(Heartbeat(endpoint.state, cause, self._fingerprint))
 

@@ -1,8 +1,8 @@
-"""Loop of the plant end, for any plant and any network.
+"""Loop of the plant end, for any plant and any network: wait → receive → tick → send → account.
 
-The loop is wait → receive → tick → send → account. An emulated plant waits for the tick grid; with hardware `advance`
-blocks until the next sample; in lockstep the loop waits for the answer to its last measurement, so that a run repeats
-bit for bit.
+A computed plant waits for the tick grid; with hardware `advance` blocks until the next sample; in lockstep the loop
+waits for the answer to its last measurement, so that a run repeats bit for bit. A tick passes the command through the
+injected faults to the endpoint, and the endpoint's measurement through them to the network.
 """
 
 from __future__ import annotations
@@ -10,11 +10,17 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from math import isfinite
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
+from aeroloop.plant_emulator.faults.injection import FaultTransition
+from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.plant import Plant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
@@ -26,6 +32,9 @@ from aeroloop.protocol.wire.transmit import UNCHANGED
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
 """With hardware, the loop waits for the answer to a sample for this share of the period."""
+ANSWER_TIMEOUT_S: Final = 2.0
+"""Longest wait for an answer in lockstep, where the watchdog, counted in ticks, stands still. A live controller answers
+within milliseconds, with a law in Python within a second."""
 
 
 class PlantNetwork(ABC):
@@ -35,12 +44,15 @@ class PlantNetwork(ABC):
         timing: Timing of the driver's loop; None in lockstep.
         skipped: Ticks of sessions that the driver missed.
         notes: What a status says of the machine, such as real-time settings that it refused.
+        sent: Measurement frames sent; not UNCHANGED, which is sent in lockstep only.
+        steps: Steps that lockstep may still take; None for no limit.
     """
 
     def __init__(self) -> None:
         self.timing: LoopTiming | None = None
-        self.skipped = 0
+        self.skipped = self.sent = 0
         self.notes: list[str] = []
+        self.steps: int | None = None
 
     @property
     @abstractmethod
@@ -54,10 +66,6 @@ class PlantNetwork(ABC):
     @abstractmethod
     def take_inbox(self) -> None:
         """Between two ticks, process what was received: claims, releases, operator commands."""
-
-    @abstractmethod
-    def send(self, frame: bytes) -> None:
-        """Send a measurement frame; UNCHANGED only in lockstep, where the controller cannot detect it by time."""
 
     @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
@@ -74,15 +82,23 @@ class PlantNetwork(ABC):
         """Publish events and a status that is due, and close the link of a session that ended."""
 
     @abstractmethod
+    def publish_status(self) -> None:
+        """Publish the status now."""
+
+    @abstractmethod
     def leave(self) -> None:
         """Publish that the plant stopped at 0 V, and leave the network."""
 
 
 class Driver:
-    """Runs the plant end's loop until `stop` is set; `settings` give watchdog, limits and arming.
+    """Runs the plant end's loop until `stop` is set; `settings` give watchdog, limits, arming and faults.
 
     Raises:
-        ValueError: The wire commands another number of actuators than the plant has.
+        ValueError: The wire commands another number of actuators than the plant has, or a fault is of a motor that it
+            does not have. The plant is closed then.
+
+    Attributes:
+        faulty: The plant with its faults.
     """
 
     def __init__(
@@ -94,22 +110,24 @@ class Driver:
         stop: threading.Event,
         clock: Clock = time,
     ) -> None:
-        self._plant = plant
-        self._clock = clock
-        self._loop = loop
-        self._settings = settings
-        self._stop = stop
+        self._loop, self._stop, self._clock = loop, stop, clock
+        self._session: str | None = None  # of the last tick
         self._counter = 0  # of the measurement sent last
         self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
-        self.endpoint = Endpoint(
-            plant,
-            wire,
-            loop.period_ns,
-            lockstep=loop.lockstep,
-            watchdog_s=settings.watchdog_s,
-            limits=settings.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost),
-            armed=settings.armed_at_start,
-        )
+        try:
+            self.faulty = settings.with_faults(plant, loop.period)
+            self.endpoint = Endpoint(
+                self.faulty,
+                wire,
+                loop.period_ns,
+                lockstep=loop.lockstep,
+                watchdog_s=settings.watchdog_s,
+                limits=settings.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost),
+                armed=settings.armed_at_start,
+            )
+        except ValueError:
+            plant.close()  # it may be a machine
+            raise
 
     def run(self, network: PlantNetwork) -> None:
         """Run until `stop` is set or the plant fails; then close the plant at 0 V and leave the network.
@@ -129,19 +147,19 @@ class Driver:
             raise
         finally:
             try:
-                self._plant.close()
+                self.faulty.close()
             finally:
                 network.leave()
 
     def _run_real_time(self) -> None:
         """Wait for a tick, receive, tick and send, account; a plant that paces the loop waits in `advance`."""
-        network, endpoint = self._network, self.endpoint
+        network, endpoint, plant = self._network, self.endpoint, self.faulty
         network.notes = prepare_process(self._loop)
         timing = network.timing = LoopTiming(clock=self._clock)
-        grid = None if self._plant.paces else TickGrid(self._loop.period_ns, clock=self._clock)
+        grid = None if plant.paces else TickGrid(self._loop.period_ns, clock=self._clock)
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
-            k = grid.wait() if grid else endpoint.ticked + self._plant.passed
+            k = grid.wait() if grid else endpoint.ticked + plant.passed
             woke_ns = self._clock.monotonic_ns()
             due_ns = grid.due_ns if grid else woke_ns
             before = endpoint.session
@@ -149,54 +167,61 @@ class Driver:
             if grid and endpoint.session not in (None, before):
                 # Granting took time, and the controller takes its grid from the session's first measurement.
                 k, skipped = grid.wait(), grid.skipped
-            self._tick(self._command(), k)
+            arrival = None
+            if (link := network.link) is not None:  # hardware applies a command at once, so the loop waits for it
+                arrival = link.wait(ANSWER_SHARE * self._loop.period) if plant.paces else link.take()
+            self._tick(arrival, k)
             if endpoint.session:
-                network.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+                network.skipped += grid.skipped - skipped if grid else plant.passed - 1
             collect_garbage()
             timing.woke(due_ns, woke_ns)
             timing.done()
 
-    def _command(self) -> Arrival | None:
-        """Return the command for this period. Hardware applies it at once, so the loop waits for it."""
-        link = self._network.link
-        if link is None:
-            return None
-        return link.wait(ANSWER_SHARE * self._loop.period) if self._plant.paces else link.take()
-
     def _run_lockstep(self) -> None:
         """Tick and send, then wait for the answer, which is the next tick's command."""
-        arrival = None
+        network, arrival = self._network, None
         while not self._stop.is_set():
-            self._network.take_inbox()
-            if self._network.link is None or not self._may_step():
-                self._clock.sleep(IDLE_WAIT_S if self._network.link is None else 0)
-                self._network.follow_session()
+            network.take_inbox()
+            if network.link is None or network.steps == 0:
+                self._clock.sleep(IDLE_WAIT_S if network.link is None else 0)
+                network.follow_session()
                 continue
             echo = self._tick(arrival, self.endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
+            if network.steps is not None:
+                network.steps -= 1
+                if network.steps == 0:
+                    network.publish_status()  # ends the wait of the `advance` query's sender
 
     def _await_answer(self, echo: int) -> Arrival | None:
         """Wait for the command that echoes a counter. Returns None if the session ends first."""
-        deadline = self._clock.monotonic() + self._settings.answer_timeout_s
-        while self._network.link and not self._stop.is_set():
-            arrival = self._network.link.wait(IDLE_WAIT_S)
+        network = self._network
+        deadline = self._clock.monotonic() + ANSWER_TIMEOUT_S
+        while network.link and not self._stop.is_set():
+            arrival = network.link.wait(IDLE_WAIT_S)
             if arrival is not None and self.endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
-            self._network.take_inbox()
+            network.take_inbox()
             if self._clock.monotonic() > deadline:
-                self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
-            self._network.follow_session()
+                self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {ANSWER_TIMEOUT_S:g} s")
+            network.follow_session()
         return None
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
-        network, measured = self._network, self.endpoint.wire.measurement
+        network, measured, lockstep = self._network, self.endpoint.wire.measurement, self._loop.lockstep
         measurement = self.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = self._clock.monotonic_ns()
+        if measurement == UNCHANGED and not lockstep:  # not a frame, so no fault acts on it
+            outgoing = self.faulty.passes("measurement", None) or [UNCHANGED]
+        else:
+            outgoing = self.faulty.passes("measurement", measurement)
         echo = None
-        for sent in self._outgoing(measurement):
-            network.send(sent)
-            if self._loop.lockstep:
+        for sent in outgoing:
+            if (sent or lockstep) and network.link is not None:
+                network.link.send(sent)
+                network.sent += sent != UNCHANGED
+            if lockstep:
                 # The controller takes a frame without a counter for the tick after its last.
                 echo = measured.counter(sent)
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
@@ -206,25 +231,62 @@ class Driver:
         return echo
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Tick the plant end without the network: `Endpoint.tick`, with the hook for commands before it."""
-        if frame and len(frame) != self.endpoint.wire.command.size:
+        """Tick the plant end without the network: `Endpoint.tick`, with the faults of commands before it."""
+        endpoint = self.endpoint
+        if frame and len(frame) != endpoint.wire.command.size:
             frame = self._malformed
-        passed = self._incoming(frame)
-        measurement = self.endpoint.tick(passed, k)
-        if passed is None and frame is not None:
-            self.endpoint.outcome = Outcome.WITHHELD
+        if endpoint.session != self._session:
+            self._session = endpoint.session
+            self.faulty.forget_frames()
+            if self._session is not None:
+                self.faulty.start()
+        passed = self.faulty.passes("command", frame)
+        measurement = endpoint.tick(passed[-1] if passed else None, k)
+        if frame is not None and not passed:
+            endpoint.outcome = Outcome.WITHHELD
+        self._notify(self.faulty.transitions())
         return measurement
 
-    # ── hooks of subclasses ──
+    def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
+        """Add faults with start and end counted from now; if `clear`, remove all others first.
 
-    def _may_step(self) -> bool:
-        """Whether lockstep may take its next step."""
-        return True
+        Returns:
+            What was done, a line each; they are events, too.
 
-    def _incoming(self, frame: bytes | None) -> bytes | None:
-        """Change or drop a received command before the endpoint gets it."""
-        return frame
+        Raises:
+            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
+        """
+        self._notify(self.faulty.inject(faults, "injected", clear=clear))
+        names = [*([None] if clear else []), *map(str, faults)]
+        for name in names:
+            self.endpoint.record_change("inject", name=name)
+        done = ["no faults any more" if name is None else f"fault injected: {name}" for name in names]
+        self._notify([FaultTransition(self.faulty.ticks, text) for text in done])
+        return done
 
-    def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        """Return the frames to send for the endpoint's measurement."""
-        return [] if frame is None else [frame]
+    def fault_statuses(self) -> list[FaultStatus]:
+        """Status of every fault."""
+        ticks = self.faulty.ticks
+        return self.faulty.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
+
+    def truth(self) -> Truth | None:
+        """The present true state, with the tick of the measurement taken of it; None where the plant knows none."""
+        state, endpoint = self.faulty.plant.truth(), self.endpoint
+        return state and Truth(
+            tick=endpoint.ticked,
+            attitude=state.attitude,
+            rate=state.rate,
+            voltages=state.voltages,
+            signals={name: value if isfinite(value) else None for name, value in state.signals.items()},
+            session=endpoint.session,
+            session_tick=None if endpoint.session is None else endpoint.session_tick,
+        )
+
+    def _notify(self, transitions: Sequence[FaultTransition]) -> None:
+        """Queue events of faults, with the session's tick if there was one then."""
+        endpoint = self.endpoint
+        for transition in transitions:
+            tick = endpoint.event_tick
+            if tick is not None:
+                tick = max(0, tick + transition.tick - self.faulty.ticks)
+            endpoint.notices.append(Notice("fault", transition.text, endpoint.session, tick))

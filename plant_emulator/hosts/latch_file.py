@@ -61,10 +61,8 @@ class LatchFile:
         self._wanted = self._kept = self.found
         self._wanted_at = time.monotonic()
         self._error: str | None = None  # of the last attempt for `_wanted`
-        self._closing = False
         self._attempt(self.found)  # shows from the start whether the directory can be written
-        self._thread = threading.Thread(target=self._run, daemon=True)  # no hanging disk keeps the process alive
-        self._thread.start()
+        threading.Thread(target=self._run, daemon=True).start()  # no hanging disk keeps the process alive
 
     def keep(self, latch: Latch | None) -> None:
         """Have this latch on disk from now on, or none; returns at once."""
@@ -90,23 +88,15 @@ class LatchFile:
         waits = time.monotonic() - self._wanted_at < KEPT_S
         return self._error or (None if waits else self.unkept)
 
-    def close(self) -> None:
-        """Wait for the disk, and end the thread."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-        self._thread.join(KEPT_S)
-
     def _run(self) -> None:
-        closing = False
-        while not closing:
+        while True:
             with self._changed:
-                self._changed.wait_for(
-                    lambda: self._closing or (self._wanted != self._kept and self._error is None),
-                    RETRY_S if self._error else None,
+                new = self._changed.wait_for(
+                    lambda: self._wanted != self._kept and self._error is None, RETRY_S if self._error else None
                 )
-                latch, closing = self._wanted, self._closing
-            self._attempt(latch)
+                latch = self._wanted
+            if new or self._error:
+                self._attempt(latch)
 
     def _attempt(self, latch: Latch | None) -> None:
         error = None

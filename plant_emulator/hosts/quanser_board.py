@@ -26,27 +26,18 @@ from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, FilteredDeriva
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
-"""Analog outputs that carry the motors' voltages, and digital outputs that enable their amplifiers."""
+"""Analog outputs that carry the voltages u2 and u3, and digital outputs that enable their amplifiers."""
 ENCODERS: Final = np.array([2, 3], dtype=np.uint32)
 """Pitch and yaw; 0 and 1 are the rotors'."""
 GYRO: Final = np.array([3000, 3001, 3002], dtype=np.uint32)
-LEDS: Final = np.array([11000, 11001, 11002], dtype=np.uint32)
-"""Red, green, blue; 0…1."""
+COUNTS: Final[Mapping[str, tuple[int, int]]] = {"quanser_aero2_usb": (2880, 4096), "quanser_aero_usb": (2048, 4096)}
+"""Encoder counts a turn, pitch and yaw, by type of card; as in Quanser's own classes."""
 
-COLOURS: Final[Mapping[PlantState, tuple[float, float, float]]] = {
-    PlantState.IDLE: (0.0, 0.2, 1.0),
-    PlantState.GRANTED: (1.0, 0.7, 0.0),
-    PlantState.DRIVEN: (0.0, 1.0, 0.0),
-    PlantState.TRIPPED: (1.0, 0.0, 0.0),
-}
-"""Blue, yellow, green, red."""
-DARK: Final = (0.0, 0.0, 0.0)
-
+OFF: Final = (0.0, 0.0)
 _SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board counts those it overwrote
 _UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
 
@@ -64,14 +55,14 @@ class BoardDriver(Driver):
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
-        self._board = QuanserPlant(settings.quanser, loop.period)
+        self._board = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)
         super().__init__(self._board, loop, wire, settings, stop)
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         board, network = self._board, self._network
-        board.follow(self.endpoint.state)  # after a claim or a release since the last tick
+        board.amplify(self.endpoint.session is not None)  # after a claim or a release since the last tick
         echo = super()._tick(arrival, k)
-        board.follow(self.endpoint.state)  # after a trip or a first command in the tick
+        board.amplify(self.endpoint.session is not None)  # after a trip in the tick
         if board.failures:
             note = f"the board: {board.failures} failed calls, the last: {board.failure}"
             network.notes = [*(note for note in network.notes if not note.startswith("the board: ")), note]
@@ -79,28 +70,23 @@ class BoardDriver(Driver):
 
 
 class QuanserPlant(Plant):
-    """The Aero on its board.
+    """The Aero on its board. Its encoders are relative: keep the Aero level and at yaw 0 while this object is made.
 
-    Its encoders are relative: keep the Aero level and at yaw 0 while this object is made. Sampling starts at the first
-    `actuate` or `advance`. The amplifier is off until `follow` switches it on.
-
-    Each `advance` is one period. After a late call the newest sample is measured and `passed` is the number of periods
-    that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
-    `passed` stays on the board's clock. `period` is the time between samples [s].
-
+    Each `advance` is one period [s]. After a late call the newest sample is measured, `passed` is the number of periods
+    that passed, and the next `passed` − 1 calls return at once and measure NaN. `watchdog_s` is the board's [s].
     `failures` counts failed calls, reads without a sample and expiries of the watchdog; `failure` is the last one's
     message.
 
     Raises:
-        QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`
-            or `advance`, it cannot be started.
+        QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`,
+            `advance` or `amplify`, it cannot be started.
     """
 
     actuators = 2
     paces = True
 
-    def __init__(self, settings: QuanserSettings, period: float) -> None:
-        self._settings, self._period = settings, period
+    def __init__(self, settings: QuanserSettings, period: float, watchdog_s: float) -> None:
+        self._settings, self._period, self._watchdog_s = settings, period, watchdog_s
         try:
             self._hardware: Any = import_module("quanser.hardware")
             # Not every version exports this one in the module above.
@@ -112,29 +98,31 @@ class QuanserPlant(Plant):
             ) from error
         self._error: type[Exception] = self._hardware.HILError
         self._board: Any = self._hardware.HIL()
-        self.failures = 0
-        self.failure: str | None = None
+        self.failures, self.failure = 0, ""
 
-        self._steps = [
-            sign * 2 * pi / counts for sign, counts in zip(settings.encoder_signs, settings.counts, strict=True)
-        ]
+        counts = COUNTS[settings.card_type]
+        self._steps = [sign * 2 * pi / turn for sign, turn in zip(settings.encoder_signs, counts, strict=True)]
         self._filters: list[FilteredDerivative] | None = None  # made anew after an invalid sample
         self._counts = np.zeros(2, dtype=np.int32)
         self._gyro = np.zeros(3) if settings.rate == "gyro" else None
-        self._measurement = NO_MEASUREMENT
-
-        self._held: tuple[float, ...] = (0.0, 0.0)
-        self._state = PlantState.IDLE
-        self._lit: PlantState | None = None
-        self._amplified = False
-
+        self._held: tuple[float, ...] = OFF
+        self._driven = self._amplified = False  # wanted, written
         self._task: object = None
         self._running = self._closed = self._expired = False
         self._written = True  # whether every write since the last sample succeeded
         self._read_samples = self._lost_samples = 0
         self._index = self._owed = 0  # index: of the last sample, on the board's clock
         self._advanced_ns = 0
-        self._open()
+
+        card = f"{settings.card_type} '{settings.card_identifier}'"
+        with self._required(f"cannot open {card}", "; is it plugged in, switched on, and free?"):
+            self._board.open(settings.card_type, settings.card_identifier)
+        try:
+            with self._required(f"cannot make {card} ready"):
+                self._prepare()
+        except QuanserError:
+            self.close()
+            raise
 
     # ── Plant ──
 
@@ -146,9 +134,8 @@ class QuanserPlant(Plant):
         limit = self._settings.voltage_limit
         self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
         self._start()
-        if self._expired and (any(self._held) or not self._clear()):
-            return
-        self._write_outputs()
+        if not self._expired or (not any(self._held) and self._clear()):
+            self._write_outputs()
 
     def advance(self) -> None:
         """Wait for the board's next sample; a failed read takes a period, too."""
@@ -176,57 +163,32 @@ class QuanserPlant(Plant):
         """Values of the last sample; NaN if it could not be read."""
         return self._measurement
 
+    def amplify(self, on: bool) -> None:
+        """Switch the amplifier on for a session, and off after it."""
+        if on is not self._driven:
+            self._driven = on
+            self._start()
+            if not self._expired:
+                self._write_outputs()
+
     def close(self) -> None:
-        """Set 0 V, switch amplifier and lights off, and close the board. A failed step does not prevent the next.
+        """Set 0 V, switch the amplifier off, and close the board. A failed step does not prevent the next.
 
         If neither 0 V nor amplifier-off could be written, the watchdog is left running, so that it expires.
         """
         if self._closed:
             return
         self._closed = True
-        board = self._board
-        still = self._write_motors((0.0, 0.0))
-        off = self._amplify(False)
-        self._light(DARK)
+        still, off = self._write_motors(OFF), self._write_amplifier(False)
         if still or off:
-            self._try(board.watchdog_stop)
+            self._try(self._board.watchdog_stop)
         if self._running:
-            self._try(board.task_stop, self._task)
+            self._try(self._board.task_stop, self._task)
         if self._task is not None:
-            self._try(board.task_delete, self._task)
-        self._try(board.close)
-
-    def follow(self, state: PlantState) -> None:
-        """Switch the amplifier on for a session and off after it, and show the state as a colour.
-
-        While its watchdog is expired, the board shows red by itself.
-        """
-        was_driven, self._state = self._driven, state
-        if self._driven is not was_driven:
-            self._start()
-            if not self._expired:
-                self._write_outputs()
-        if state is not self._lit and not self._expired:
-            self._lit = state
-            self._light(COLOURS[state])
-
-    @property
-    def _driven(self) -> bool:
-        return self._state in (PlantState.GRANTED, PlantState.DRIVEN)
+            self._try(self._board.task_delete, self._task)
+        self._try(self._board.close)
 
     # ── starting ──
-
-    def _open(self) -> None:
-        settings = self._settings
-        card = f"{settings.card_type} '{settings.card_identifier}'"
-        with self._required(f"cannot open {card}", "; is it plugged in, switched on, and free?"):
-            self._board.open(settings.card_type, settings.card_identifier)
-        try:
-            with self._required(f"cannot make {card} ready"):
-                self._prepare()
-        except QuanserError:
-            self.close()
-            raise
 
     def _prepare(self) -> None:
         board, n = self._board, len(MOTORS)
@@ -235,9 +197,6 @@ class QuanserPlant(Plant):
         board.write_digital(MOTORS, n, np.zeros(n, dtype=np.int8))
         board.watchdog_set_analog_expiration_state(MOTORS, n, np.zeros(n))
         board.watchdog_set_digital_expiration_state(MOTORS, n, np.zeros(n, dtype=np.int32))
-        with suppress(self._error):  # lights are not safety-relevant; the motors' states above are
-            red = np.array(COLOURS[PlantState.TRIPPED])
-            board.watchdog_set_other_expiration_state(LEDS, len(LEDS), red)
         board.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(2, dtype=np.int32))
 
         gyro = None if self._gyro is None else GYRO
@@ -245,16 +204,14 @@ class QuanserPlant(Plant):
         board.read(*inputs, None, self._counts, None, self._gyro)
         self._measurement = self._seen(1)
         self._task = board.task_create_reader(_SAMPLES_IN_BUFFER, *inputs)
-        virtual = "@" in self._settings.card_identifier  # it waits for its reader, as in Quanser's own class
-        mode = self._overflow.WAIT_ON_OVERFLOW if virtual else self._overflow.OVERWRITE_ON_OVERFLOW
-        board.task_set_buffer_overflow_mode(self._task, mode)
+        board.task_set_buffer_overflow_mode(self._task, self._overflow.OVERWRITE_ON_OVERFLOW)
 
     def _start(self) -> None:
         """Start the watchdog and the sampling task, once."""
         if self._running or self._closed:
             return
         with self._required(f"cannot start {self._settings.card_type}"):
-            self._board.watchdog_start(self._settings.board_watchdog_s)
+            self._board.watchdog_start(self._watchdog_s)
             self._board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _UNLIMITED)
         self._running = True
         self._advanced_ns = time.monotonic_ns()
@@ -272,12 +229,11 @@ class QuanserPlant(Plant):
         """Wait for the newest sample. Returns the periods that passed, or 0 if the read failed."""
         board = self._board
         try:
-            read = board.task_read(self._task, 1, None, self._counts, None, self._gyro)
+            if board.task_read(self._task, 1, None, self._counts, None, self._gyro) != 1:
+                self._failed("the board's task gave no sample")
+                return 0
         except self._error as error:
             self._failed(_text(error))
-            return 0
-        if read != 1:
-            self._failed("the board's task gave no sample")
             return 0
         with suppress(self._error):  # not every board may count them
             self._lost_samples = board.task_get_buffer_overflows(self._task)
@@ -291,13 +247,10 @@ class QuanserPlant(Plant):
         pitch, yaw = (step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True))
         attitude = attitude_of(pitch, yaw)
         if self._gyro is not None:
-            axes = zip(settings.gyro_axes, settings.gyro_signs, strict=True)
-            x, y, z = (sign * settings.gyro_scale * self._gyro.item(axis) for axis, sign in axes)
+            x, y, z = (self._gyro.item(abs(axis) - 1) * (1 if axis > 0 else -1) for axis in settings.gyro_channels)
             return Measurement(attitude, (x, y, z))
         if self._filters is None:
-            self._filters = [
-                FilteredDerivative(settings.bandwidth, settings.damping_ratio, self._period) for _ in self._steps
-            ]
+            self._filters = [FilteredDerivative(settings.bandwidth, self._period) for _ in self._steps]
         of_pitch, of_yaw = self._filters
         for _ in range(passed):
             pitch_rate, yaw_rate = of_pitch.update(pitch), of_yaw.update(yaw)
@@ -307,25 +260,20 @@ class QuanserPlant(Plant):
 
     def _write_outputs(self) -> None:
         if self._amplified is not self._driven:
-            self._amplify(self._driven)
-        self._write_motors(self._held if self._driven else (0.0, 0.0))
+            self._write_amplifier(self._driven)
+        self._write_motors(self._held if self._driven else OFF)
 
     def _write_motors(self, voltages: Sequence[float]) -> bool:
-        settings, volts = self._settings, np.zeros(2)
-        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, voltages, strict=True):
-            volts[channel] = sign * voltage
-        done = self._try(self._board.write_analog, MOTORS, len(MOTORS), volts)
+        done = self._try(self._board.write_analog, MOTORS, 2, np.multiply(self._settings.motor_signs, voltages))
         self._written &= done
         return done
 
-    def _amplify(self, on: bool) -> bool:
-        done = self._try(self._board.write_digital, MOTORS, len(MOTORS), np.full(len(MOTORS), on, dtype=np.int8))
-        self._amplified = on if done else self._amplified
+    def _write_amplifier(self, on: bool) -> bool:
+        done = self._try(self._board.write_digital, MOTORS, 2, np.full(2, on, dtype=np.int8))
+        if done:
+            self._amplified = on
         self._written &= done
         return done
-
-    def _light(self, colour: tuple[float, float, float]) -> None:
-        self._try(self._board.write_other, LEDS, len(LEDS), np.array(colour))
 
     def _keep_alive(self, *, reload: bool) -> bool:
         """Reload the watchdog or read its state. False if it has expired or cannot be read."""
@@ -338,29 +286,24 @@ class QuanserPlant(Plant):
             return False
         if not alive:
             self._failed("the board's watchdog expired")
-            self._expired = True
-            self._amplified = False
-            self._lit = None
+            self._expired, self._amplified = True, False
         return alive
 
     def _clear(self) -> bool:
         """Clear the expired watchdog and restart it with outputs at 0 V. False if a step failed."""
         self._unlock()
         # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
-        armed = self._try(self._board.watchdog_start, self._settings.board_watchdog_s)
-        still = self._write_motors((0.0, 0.0))
-        done = self._amplify(False) and still and armed
-        self._expired = not done
-        if done:
-            self.follow(self._state)
-        return done
+        armed = self._try(self._board.watchdog_start, self._watchdog_s)
+        still = self._write_motors(OFF)
+        off = self._write_amplifier(False)
+        self._expired = not (armed and still and off)
+        return not self._expired
 
     def _unlock(self) -> None:
         """Stop and clear the watchdog, so that outputs can be written; failures show at the next write."""
-        with suppress(self._error):
-            self._board.watchdog_stop()
-        with suppress(self._error):  # a watchdog that has not expired may refuse
-            self._board.watchdog_clear()
+        for call in (self._board.watchdog_stop, self._board.watchdog_clear):
+            with suppress(self._error):  # a watchdog that has not expired may refuse to be cleared
+                call()
 
     def _try(self, call: Callable[..., object], *args: object) -> bool:
         try:

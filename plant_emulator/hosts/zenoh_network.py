@@ -7,7 +7,6 @@ takes them between ticks, so that only one thread uses the endpoint.
 
 from __future__ import annotations
 
-import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from zenoh.handlers import RingChannel
 from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.hosts.driver import PlantNetwork
 from aeroloop.plant_emulator.hosts.latch_file import KEPT_S, Latch, LatchFile
+from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
     Claim,
@@ -35,11 +35,11 @@ from aeroloop.protocol.messages.models import (
 )
 from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter, batches_per_s, record_json
+from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
@@ -51,8 +51,7 @@ class ZenohNetwork(PlantNetwork):
     """A plant end, an Endpoint or the bridge's Relay, on the network.
 
     LatchFile keeps the latch in `state_directory`, and one that is there holds from the start. `changed` is notified
-    when a command arrives, for an owner that waits for more than one thing; `faults` returns the status of an
-    emulator's faults.
+    when a command arrives, for an owner that waits for more than one thing.
     """
 
     def __init__(
@@ -62,20 +61,15 @@ class ZenohNetwork(PlantNetwork):
         endpoint: VehicleClaim,
         state_directory: Path | None,
         changed: Condition | None = None,
-        faults: Callable[[], list[FaultStatus]] = list,
     ) -> None:
         super().__init__()
-        self._faults = faults
-        self._role = role
-        self._loop = loop
-        self._endpoint = endpoint
+        self._role, self._loop, self._endpoint, self._changed = role, loop, endpoint, changed
         self._link: ZenohLink | None = None
-        self._changed = changed
         self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
         self._counters = endpoint.wire.measurement.counters
         self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
-        self._sent = self._received = 0
+        self._received = 0
         self._refused = 0  # by the links of earlier sessions
         self._latch_file = LatchFile(state_directory, role.vehicle)
         self._since = datetime.now(UTC) if endpoint.cause else None
@@ -99,7 +93,7 @@ class ZenohNetwork(PlantNetwork):
         role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
-        role.serve("record", SessionRecord, self._read_record)
+        role.serve("record", SessionRecord, self._keep_record)
         role.serve("show", Request, lambda _: self._show)
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
         role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
@@ -122,12 +116,6 @@ class ZenohNetwork(PlantNetwork):
             self._read_others()
         if self._role.take_inbox():
             self.follow_session()
-
-    def send(self, frame: bytes) -> None:
-        """Send a measurement frame; UNCHANGED only in lockstep."""
-        if self._link is not None and (frame or self._loop.lockstep):
-            self._link.send(frame)
-            self._sent += frame != UNCHANGED
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Write the trace row, measure the latency, publish events and a due status."""
@@ -184,7 +172,7 @@ class ZenohNetwork(PlantNetwork):
                 rate_hz=max(0.0, (endpoint.ticked - tick) / (now - then)),
                 skipped=self.skipped,
                 received=self._received,
-                sent=self._sent,
+                sent=self.sent,
                 refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
                 stale=endpoint.stale,
                 saturated=endpoint.saturated,
@@ -193,17 +181,21 @@ class ZenohNetwork(PlantNetwork):
                 timing=report(self.timing) if self.timing else None,
                 notes=self.notes,
                 lacks_recorder="gone" if self._recorder.gone else None,
-                faults=self._faults(),
+                faults=self.faults(),
             )
         )
         self._published = endpoint.state, endpoint.ticked, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
+    def faults(self) -> list[FaultStatus]:
+        """Status of every injected fault, which an emulator has."""
+        return []
+
     def leave(self) -> None:
         """Publish the end of the trace, the stop and a last status."""
         self.follow_session()
         self._trace.finish()
-        self._latch_file.close()
+        self._latch_file.wait()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.publish_status()
 
@@ -238,15 +230,14 @@ class ZenohNetwork(PlantNetwork):
         done = self._endpoint.release(release.session)
         return Answer(done=done, text="released" if done else f"no session {release.session} runs here")
 
-    def _read_record(self, record: SessionRecord) -> Callable[[], Answer]:
+    def _keep_record(self, record: SessionRecord) -> Callable[[], Answer]:
         changes = record_json(record.in_force)  # of many points it takes milliseconds
 
         def keep() -> Answer:
-            done = self._endpoint.keep(record)
-            if done:
-                self._trace.record(changes)
-            text = "kept" if done else f"no session {record.session} of {record.controller} runs"
-            return Answer(done=done, text=text)
+            if not self._endpoint.keep(record):
+                return Answer(done=False, text=f"no session {record.session} of {record.controller} runs")
+            self._trace.record(changes)
+            return Answer(done=True, text="kept")
 
         return keep
 
@@ -256,16 +247,14 @@ class ZenohNetwork(PlantNetwork):
     def _read_others(self) -> None:
         """Trip if another plant end publishes under this one's name, as after a network was cut and healed."""
         self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
-        if (sample := self._others.try_recv()) is not None:
-            with suppress(MessageError):
-                other = Status.decode(sample.payload.to_bytes(), extra="ignore").process
-                if self._endpoint.trip is not TripCause.DUPLICATE:
-                    which = f"this one ({self._role.process}) and another ({other})"
-                    text = (
-                        f"two plants are named {self._role.vehicle}, {which}; end one of them, then `aeroloop op arm`"
-                    )
-                    self._endpoint.stop(TripCause.DUPLICATE, text)
-                self.follow_session()
+        if (sample := self._others.try_recv()) is None or self._endpoint.trip is TripCause.DUPLICATE:
+            return
+        with suppress(MessageError):
+            other = Status.decode(sample.payload.to_bytes(), extra="ignore").process
+            which = f"this one ({self._role.process}) and another ({other})"
+            text = f"two plants are named {self._role.vehicle}, {which}; end one of them, then `aeroloop op arm`"
+            self._endpoint.stop(TripCause.DUPLICATE, text)
+            self.follow_session()
 
     # ── operator commands and the latch ──
 
@@ -290,7 +279,7 @@ class ZenohNetwork(PlantNetwork):
             changed.set()
 
         def answer() -> Answer:
-            if not (unkept := self._latch_file.unkept):
+            if (unkept := self._latch_file.unkept) is None:
                 return answers[0]
             text = f"{answers[0].text}; but a restart of the plant would forget it: {unkept}"
             return answers[0].model_copy(update={"text": text})
@@ -302,85 +291,12 @@ class ZenohNetwork(PlantNetwork):
 
     def _keep_latch(self) -> None:
         """Have the latch of a tripped plant on disk, and none of one that is not."""
-        endpoint, latch = self._endpoint, None
-        if endpoint.cause is None:
+        trip, cause, operator_only = self._endpoint.trip, self._endpoint.cause, self._endpoint.operator_only
+        if cause is None:
             self._since = None
-        elif any(notice.kind == "tripped" for notice in endpoint.notices):
+        elif any(notice.kind == "tripped" for notice in self._endpoint.notices):
             self._since = datetime.now(UTC)
-        if endpoint.trip is not None and endpoint.cause is not None and self._since is not None:
-            latch = Latch(
-                cause=endpoint.trip, text=endpoint.cause, operator_only=endpoint.operator_only, since=self._since
-            )
+        latch = None
+        if trip is not None and cause is not None and self._since is not None:
+            latch = Latch(cause=trip, text=cause, operator_only=operator_only, since=self._since)
         self._latch_file.keep(latch)
-
-
-class PlantTrace:
-    """Trace of the plant end: a row for every tick of a session, and the changes between ticks.
-
-    The owner adds a row after each measurement was sent, and calls `follow` whenever a session may have begun or ended.
-    All waiting rows are published when a session ends; changes outside of sessions at once, without rows. `publish` is
-    called with every batch; `run` is the random number that identifies this process, drawn if None.
-    """
-
-    def __init__(
-        self, loop: LoopSettings, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None
-    ) -> None:
-        self._publish = publish
-        self._command_bytes = wire.command.size
-        run = secrets.randbits(64) if run is None else run
-        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
-
-    def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Add the row of the last tick, and publish a batch that is due. Nothing without a session.
-
-        The arguments are those of `PlantNetwork.after_tick`; `measurement` is None if the tick tripped.
-        """
-        writer = self._writer
-        if not writer.session:
-            return
-        command, received_ns = arrival or (b"", 0)
-        received_as = Sent.NONE
-        if arrival is not None:
-            received_as = Sent.SILENT if command == UNCHANGED else Sent.FRAME
-            if command and len(command) != self._command_bytes:
-                received_as, command = Sent.MALFORMED, b""
-        row = PlantRow(
-            end.ticked,
-            end.session_tick,
-            Sent.NONE if measurement is None else Sent.FRAME if measurement else Sent.SILENT,
-            received_as,
-            end.outcome,
-            0 if end.session or end.trip is None else end.trip.number,
-            end.answered,
-            sent_ns,
-            received_ns,
-            measurement or b"",
-            command,
-            end.voltages,
-        )
-        writer.row(row)
-        if writer.due(sent_ns):
-            self._publish_batch(final=False)
-
-    def follow(self, end: VehicleClaim) -> None:
-        """Move the end's changes into the trace; publish everything waiting if its session ended or none runs."""
-        writer = self._writer
-        writer.operations += end.changes
-        end.changes.clear()
-        session = end.session or ""
-        if session != writer.session or not session:
-            self.finish()
-        if session != writer.session:
-            writer.session, writer.record = session, b""
-
-    def record(self, changes: bytes) -> None:
-        """Take over the running session's gains and reference, as `record_json` has them, for later batches."""
-        self._writer.record = changes
-
-    def finish(self) -> None:
-        """Publish everything waiting; the last batch of a session is marked final, with or without rows."""
-        if self._writer.session or not self._writer.empty:
-            self._publish_batch(final=bool(self._writer.session))
-
-    def _publish_batch(self, *, final: bool) -> None:
-        self._publish(self._writer.take(time.monotonic_ns(), time.time_ns(), final=final))

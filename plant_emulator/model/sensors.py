@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from math import cos, exp, isfinite, nan, pi, sin, sqrt
-from typing import Any, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,9 @@ Scalar = TypeVar("Scalar", float, "ca.SX")
 NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
 """Measurement without a valid value, such as of a state that is not finite."""
 
+DAMPING_RATIO: Final = 0.8
+"""ζ of the derivative's filter [1]; usual on the Aero, where Quanser's own examples have it."""
+
 _BLOCK = 4096  # random numbers are drawn this many samples at a time
 
 
@@ -39,7 +42,6 @@ class SensorSettings(BaseModel, extra="forbid"):
         default="derivative", description="derivative: of the encoders' angles, filtered"
     )
     bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
-    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter [1]")
     gyro_noise: float = Field(default=0.0, ge=0, description="standard deviation of a gyro sample [rad/s]")
     gyro_bias: Vector = Field(default=(0.0, 0.0, 0.0), description="constant error of the gyro, body frame [rad/s]")
     seed: int = Field(default=0, ge=0, description="of the encoders' zeros and of the gyro's noise")
@@ -48,12 +50,12 @@ class SensorSettings(BaseModel, extra="forbid"):
 class FilteredDerivative:
     """The rate of a sampled angle, by the filter ωn² s / (s² + 2ζωn s + ωn²), exact for an angle held over a period.
 
-    `bandwidth` is ωn [rad/s], `damping_ratio` is ζ, 0…1, and `period` the time between samples [s].
+    `bandwidth` is ωn [rad/s], and `period` the time between samples [s].
     """
 
-    def __init__(self, bandwidth: float, damping_ratio: float, period: float) -> None:
-        decay = damping_ratio * bandwidth
-        ringing = bandwidth * sqrt(1 - damping_ratio**2)
+    def __init__(self, bandwidth: float, period: float) -> None:
+        decay = DAMPING_RATIO * bandwidth
+        ringing = bandwidth * sqrt(1 - DAMPING_RATIO**2)
         envelope, c, s = exp(-decay * period), cos(ringing * period), sin(ringing * period) / ringing
         self._from_lag = envelope * (c + decay * s)
         self._from_rate = envelope * s
@@ -153,7 +155,7 @@ def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
         if settings.attitude == "encoders":
             attitude = ca.vertcat(*attitude_of(pitch, yaw, ca))
         if settings.rate == "derivative":
-            derivative = FilteredDerivative(settings.bandwidth, settings.damping_ratio, period)
+            derivative = FilteredDerivative(settings.bandwidth, period)
             last = [
                 ca.if_else(filtered == filtered, filtered, now) for filtered, now in ((held[0], pitch), (held[2], yaw))
             ]

@@ -39,11 +39,22 @@ BitsOption = Annotated[
         help="Bits of attitude, rate and voltage, such as 10/6/6; out and in, such as 8/6; or cont.",
     ),
 ]
+
+
+def _checked_engine(engine: str) -> str:
+    from aeroloop.service.lab.engine import check_engine
+
+    with checked():
+        check_engine(engine)
+    return engine
+
+
 EngineOption = Annotated[
     str,
     typer.Option(
         "--engine",
         metavar="processes|dask:ADDRESS",
+        callback=_checked_engine,
         help="Run on every core, or on the workers of a Dask cluster, which trusts its network: TLS, or a private one.",
     ),
 ]
@@ -137,14 +148,6 @@ def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdow
         from aeroloop.service.terminal.show import show_all
 
         show_all(sheets(result), "markdown" if markdown else "terminal", keys)
-
-
-def check_engine(engine: str) -> None:
-    """Exit with 2 unless an engine can be used."""
-    from aeroloop.service.lab import sweep
-
-    with checked():
-        sweep.check_engine(engine)
 
 
 def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:

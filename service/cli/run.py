@@ -105,10 +105,11 @@ def can_node(config: Config = None, overrides: Overrides = None) -> None:
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
-        from aeroloop.plant_emulator.hosts.emulator import Emulator
+        from aeroloop.plant_emulator.hosts.driver import Driver
 
-        emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
-        emulator.run(CanNetwork(settings.can, settings.loop, emulator.endpoint))
+        loop, plant = settings.loop, settings.plant
+        driver = Driver(plant.make(loop.period), loop, settings.wire, plant, stop)
+        driver.run(CanNetwork(settings.can, loop, driver.endpoint))
 
     run_alone(run)
 

@@ -43,13 +43,14 @@ def show_config(
 
 def _check(settings: Settings) -> None:
     """Make what the configured processes begin with; what does not fit ends the command."""
-    from aeroloop.plant_emulator.hosts.emulator import Emulator
+    from aeroloop.plant_emulator.hosts.driver import Driver
     from aeroloop.service.control.controller import Controller
 
     with checked():
         Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         if settings.plant.via == "emulator":
-            Emulator(settings.loop, settings.wire, settings.plant, Event()).endpoint.plant.close()
+            plant, loop = settings.plant, settings.loop
+            Driver(plant.make(loop.period), loop, settings.wire, plant, Event()).endpoint.plant.close()
 
 
 @group.command()

@@ -25,9 +25,9 @@ def run_plant(role: Node, settings: Settings) -> None:
         Bridge(role, loop, wire, plant, settings.can).run()
         return
     if plant.via == "emulator":
-        from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+        from aeroloop.plant_emulator.hosts.emulator import run_emulator
 
-        EmulatorOnZenoh(role, loop, wire, plant).run()
+        run_emulator(role, loop, wire, plant)
         return
     from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
     from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork

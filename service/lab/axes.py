@@ -32,7 +32,10 @@ _RANGE: Final = re.compile(rf"({_NUMBER})\.\.({_NUMBER})\*(\d+)")
 
 
 class Axis(NamedTuple):
-    """A key of the configuration and its values, as `--set` takes them."""
+    """A key of the configuration and its values, as `--set` takes them.
+
+    With a `*` at its end, such as `law.C2*`, the values are factors of what is configured.
+    """
 
     key: str
     values: tuple[str, ...]
@@ -42,25 +45,26 @@ class Configuration(NamedTuple):
     """One combination."""
 
     overrides: tuple[str, ...]  # of the sweep's configuration
-    values: tuple[Any, ...]  # of the axes' keys, as the configuration has them; text where it has a section or a list
+    values: tuple[Any, ...]  # of the axes, as the configuration has them; text where it has a section or a list
     digest: str
 
 
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
-    """Axes of `section.key=a,b,c` or `section.key=a..b*n`, n values evenly from a to b.
+    """Axes of `section.key=a,b,c` or `section.key=a..b*n`, n values evenly from a to b; `section.key*=` has factors.
 
     Raises:
         ConfigError: Neither of them, no value, or a key that stands twice or that no experiment depends on.
     """
     axes = dict[str, Axis]()
     for axis in map(_axis, texts):
-        if axis.key in axes:
-            raise ConfigError(f"--vary gives {axis.key} twice: put all its values into one")
-        if axis.key in ("plant.wind.seed", "plant.sensors.seed"):
-            raise ConfigError(f"--vary {axis.key}: --seeds sets it")
-        if axis.key.partition(".")[0] not in SECTIONS:
-            raise ConfigError(f"--vary {axis.key}: an experiment depends on {', '.join(SECTIONS)} only")
-        axes[axis.key] = axis
+        key = axis.key.removesuffix("*")
+        if key in axes:
+            raise ConfigError(f"--vary gives {key} twice: put all its values into one")
+        if key in ("plant.wind.seed", "plant.sensors.seed"):
+            raise ConfigError(f"--vary {key}: --seeds sets it")
+        if key.partition(".")[0] not in SECTIONS:
+            raise ConfigError(f"--vary {key}: an experiment depends on {', '.join(SECTIONS)} only")
+        axes[key] = axis
     return list(axes.values())
 
 
@@ -82,11 +86,9 @@ def _spread(part: str, text: str) -> list[str]:
     if not re.match(rf"{_NUMBER}\.\.", part):
         return [part]
     found = _RANGE.fullmatch(part)
-    if found is None or not 2 <= int(found[3]) <= LIMIT:
+    if found is None or not 2 <= int(found[3]) <= LIMIT or Fraction(found[1]) == Fraction(found[2]):
         raise ConfigError(f"--vary {text}: a range is a..b*n, of n values from 2 to {LIMIT}, not {part!r}")
     low, high, last = Fraction(found[1]), Fraction(found[2]), int(found[3]) - 1
-    if low == high:
-        raise ConfigError(f"--vary {text}: the range {part!r} begins where it ends")
     whole = all(re.fullmatch(r"[+-]?\d+", end) for end in (found[1], found[2]))
     values = (low + (high - low) * i / last for i in range(last + 1))
     return [str(int(value)) if whole and value.denominator == 1 else repr(float(value)) for value in values]
@@ -101,11 +103,12 @@ def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duratio
     total = prod(len(axis.values) for axis in axes) * seeds
     if total > LIMIT:
         raise ConfigError(f"these are {total} experiments; a sweep has at most {LIMIT}")
-    found = dict[str, Configuration]()
+    configured, found = settings.description(), dict[str, Configuration]()
     for values in product(*(axis.values for axis in axes)):
-        overrides = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
+        pairs = [(axis.key, value) for axis, value in zip(axes, values, strict=True)]
+        overrides = tuple(_scaled(configured, *pair) if pair[0].endswith("*") else "=".join(pair) for pair in pairs)
         description = load_over(settings, overrides).description()
-        columns = tuple(_column(description, axis.key, given) for axis, given in zip(axes, values, strict=True))
+        columns = tuple(_column(description, *pair) for pair in pairs)
         digest = digest_of(description, duration_s)
         if digest in found:
             first, second = (" ".join(each) or "the configuration" for each in (found[digest].overrides, overrides))
@@ -114,10 +117,32 @@ def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duratio
     return list(found.values())
 
 
-def _column(description: Any, key: str, given: str) -> Any:
-    value = description
+def _scaled(configured: dict[str, Any], key: str, factor: str) -> str:
+    """The override that multiplies a configured number, or every number of a list."""
+    name = key.removesuffix("*").strip()
+    try:
+        return f"{name}={json.dumps(_times(_value(configured, name), float(factor)))}"
+    except (ValueError, TypeError):
+        raise ConfigError(f"--vary {key}={factor}: factors are numbers, of a number or a list of numbers") from None
+
+
+def _times(value: Any, factor: float) -> Any:
+    if isinstance(value, list | tuple):
+        return [_times(each, factor) for each in value]
+    return float(value) * factor
+
+
+def _value(description: dict[str, Any], key: str) -> Any:
+    value: Any = description
     for name in key.split("."):
-        value = value[name] if isinstance(value, dict) else None
+        value = value[name] if isinstance(value, dict) and name in value else None
+    return value
+
+
+def _column(description: dict[str, Any], key: str, given: str) -> Any:
+    if key.endswith("*"):
+        return float(given)
+    value = _value(description, key)
     return given if isinstance(value, dict | list) else value
 
 

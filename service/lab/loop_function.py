@@ -71,11 +71,11 @@ class Loop:
     """
 
     def __init__(self, settings: Settings) -> None:
-        wire, period, plant = settings.wire, settings.loop.period, settings.plant.effective
+        wire, period, plant = settings.wire, settings.loop.period, settings.plant
         law = _evaluated(settings)
         self._mechanism = mechanism = plant.mechanism()
         self._initially = initially(mechanism)
-        step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
+        step = step_function(mechanism, plant.rotor, plant.friction, period)
         held = {
             "measured": 6,
             "commanded": wire.actuators,
@@ -171,7 +171,7 @@ class Loop:
 
     def inputs(self, settings: Settings, ticks: int) -> dict[str, Floats]:
         """Inputs of every tick, by name, a row each; the state at the first. Random numbers as the plant draws them."""
-        plant, wire, period = settings.plant.effective, settings.wire, settings.loop.period
+        plant, wire, period = settings.plant, settings.wire, settings.loop.period
         wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
         seen = sensors.read(*self._initially)
         held = [np.nan] * (6 + wire.actuators)

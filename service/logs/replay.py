@@ -2,7 +2,7 @@
 
 The controller is sans-I/O and its rows hold all its inputs, so a loop over them must give the same commands: which were
 sent, which were silent, and every bit of them. The emulated plant is replayed from its own rows
-(plant_emulator/hosts/replay.py). With another configuration, replay computes what would have been commanded instead;
+(plant_emulator/hosts/trace.py). With another configuration, replay computes what would have been commanded instead;
 the log's plant does not respond to that, so it is no simulation.
 """
 
@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.hosts.replay import PlantDifference, PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.hosts.trace import PlantDifference, PlantReplay, PlantReplayed, why_not
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent

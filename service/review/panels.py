@@ -56,7 +56,7 @@ _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
 
 def case_of(settings: Settings) -> Case:
     """The paper's case that a session belongs to."""
-    if settings.plant.wind.blowing and not settings.plant.ideal:
+    if settings.plant.wind.blowing:
         return "wind"
     wire = settings.wire
     return "quantized" if any(signal.bits for signal in (wire.attitude, wire.rate, wire.voltage)) else "continuous"

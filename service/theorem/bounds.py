@@ -73,7 +73,7 @@ class Known:
             "max ∡e/2",
             "Assumption 3",
             "rad",
-            "assumed: the attitude error stays below twice this; from --attitude-error, else 20°, within which "
+            "assumed: the attitude error stays below twice this; 20° unless stated in Python, within which "
             "sessions begin; at least that of the invariant set",
         ),
     ]

@@ -441,9 +441,7 @@ def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) ->
     law = e.plant.law
     found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
     paper = (
-        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}° (--attitude-error)"]
-        if e.paper
-        else []
+        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}°"] if e.paper else []
     )
     return [
         f"θ is constant, within {law.radius:g} N·m·s/rad of the first estimate (law.damping_bound)",

@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from aeroloop.plant_emulator.model.aero import AeroSettings
+from aeroloop.plant_emulator.model.bodies import AeroSettings
 from aeroloop.plant_emulator.model.emulated import RotorSettings
-from aeroloop.plant_emulator.model.sensors import SensorSettings
-from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
+from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO, SensorSettings
+from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats
@@ -110,22 +110,18 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
 
     assumed, unproven = [timely], list[str]()
     held = plant.kind == "aero"
-    aero = IDEAL_AERO if plant.ideal else plant.aero
-    body = aero if held else plant.rigid_body
+    body = plant.aero if held else plant.rigid_body
     steady = body.gravity * hypot(
         *(body.mass * a - law.mass * b for a, b in zip(body.centre_of_mass, law.centre_of_mass, strict=True))
     )
     if body.gravity != law.gravity or body.inertia != law.inertia:
         unproven.append("gravity or inertia of the plant differ from the law's")
     B = np.array(law.allocation)[1:, 1:] if held else np.array(law.allocation)
-    applied = np.array(aero.thrust) if isinstance(body, AeroSettings) else np.array(plant.rigid_body.allocation)
+    applied = np.array(body.thrust) if isinstance(body, AeroSettings) else np.array(plant.rigid_body.allocation)
     motors = len(B)
     torque = float(np.linalg.norm(applied - B, 2)) * sqrt(motors) * plant.voltage_limit
     if plant.faults:
         unproven.append("plant.faults are no part of any theorem")
-    if plant.ideal:
-        known = PlantBounds(age, torque=torque, steady=steady, theta=body.damping, held_roll=held)
-        return replace(known, assumed=assumed, unproven=unproven)
 
     lag, uneven = _rotors(plant.rotor, B)
     if lag:
@@ -182,7 +178,7 @@ def _with_sensors(sensors: SensorSettings, plant: PlantBounds) -> PlantBounds:
     delta_eps = steps / 2 if sensors.attitude == "encoders" else 0.0
     delta_omega, encoder, assumed = 0.0, EncoderRate(), list(plant.assumed)
     if sensors.rate == "derivative":
-        of, ratio = sensors.bandwidth, sensors.damping_ratio
+        of, ratio = sensors.bandwidth, DAMPING_RATIO
         variation, passed, lag = _filter(of, ratio)
         turn = 2 * pi / sensors.counts[0] * sqrt(2)
         encoder = EncoderRate(of, ratio, lag, ripple=steps * variation, angle=steps / 2 * passed, turn=turn)

@@ -3,14 +3,13 @@
     … [--turns 3] [--seconds 20] [--rate 500] [--log-s 60] [--set KEY=VALUE] [tick loop start cell log]
 
 Product and floor take turns, so that both have the same share of what else the machine does; a row has the medians. A
-floor is what nobody could do without: the law's function alone, bare Zenoh, a bare sleep, the same loop in C, the
-`mcap` library's reader. Nothing is asserted. `--log-s 3600` is an hour of log.
+floor is what nobody could do without: the law's function alone, bare Zenoh, the `mcap`
+library's reader. Nothing is asserted. `--log-s 3600` is an hour of log.
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,6 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from mcap.reader import make_reader
 
@@ -88,18 +86,16 @@ def real_time(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
     """Controller, plant and recorder as processes."""
     overrides = [f"loop.rate_hz={given.rate}", *given.overrides]
     z_track = loop.lockstep(given.seconds, overrides)
-    turns, trips, wakes = [], [], []
+    turns, trips = [], []
     for _turn in range(given.turns):
         turns.append(loop.turn(given.seconds, given.rate, overrides, z_track))
         trips.append(loop.bare_round_trips(given.seconds / 4, given.rate))
-        wakes.append(loop.bare_wake_ups(given.seconds / 4, given.rate))
     ticks, in_time, skipped = (sum(getattr(each, name) for each in turns) for name in ("ticks", "in_time", "skipped"))
     for name, percent in (("p50", 50.0), ("p99", 99.0), ("p999", 99.9), ("longest", 100.0)):
         floor = median(float(np.percentile(each, percent)) for each in trips)
         ours = median(getattr(each, name) for each in turns)
         yield Row(f"round trip p{percent:g}, µs (the period is {1e6 / given.rate:g})", ours, floor, "bare Zenoh")
-    floor = median(float(np.percentile(each, 99.9)) for each in wakes)
-    yield Row("wake-up p99.9, µs", median(each.wake_p999 for each in turns), floor, "a bare sleep to the same instants")
+    yield Row("wake-up p99.9, µs", median(each.wake_p999 for each in turns), None, "")
     yield Row(f"ticks answered in time, % of {ticks}", 100 * in_time / ticks, 100, "all")
     yield Row("ticks not answered", skipped, None, "")
     yield Row("z_track in real time", median(each.over_lockstep for each in turns), 1, "in lockstep")
@@ -127,49 +123,12 @@ def start_up(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
         yield Row(f"aeroloop {' '.join(words)}, s", ours, floor, "Python with typer and rich")
 
 
-C_LOOP = """
-#include <string.h>
-#include "tick.c"
-void run(double *state, const double *desired, const double *wind, const double *error, double *out, int ticks) {
-  const double *arg[%(args)d];
-  double *res[%(results)d], after[%(states)d], w[%(work)d + 1];
-  casadi_int iw[%(ints)d + 1];
-  for (int k = 0; k < ticks; ++k) {
-    arg[0] = state; arg[1] = desired + 10 * k; arg[2] = wind + %(winds)d * k; arg[3] = error + 3 * k;
-    res[0] = after; res[1] = out + %(outs)d * k;
-    tick(arg, res, iw, w, 0);
-    memcpy(state, after, sizeof after);
-  }
-}
-"""
-
-
 def cell(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
-    """A cell of the paper's tables, 50 s, beside its ticks in a `for` loop in C; and all 26 cells."""
-    ticks = settings.loop.ticks(50.0)
+    """A cell of the paper's tables, 50 s, in compiled C; and all 26 cells."""
     while not loop_function.loop_of(settings).in_c:
         run_experiment(settings, 50.0)
-    compiled = loop_function.loop_of(settings)
-    function, inputs = compiled.tick, compiled.inputs(settings, ticks)
-    sizes = {"args": function.sz_arg(), "results": function.sz_res(), "work": function.sz_w(), "ints": function.sz_iw()}
-    sizes |= {"states": function.size1_in(0), "winds": function.size1_in(2), "outs": function.size1_out(1)}
-    with tempfile.TemporaryDirectory() as folder:
-        generator = ca.CodeGenerator("tick.c")
-        generator.add(function)
-        generator.generate(f"{folder}/")
-        Path(folder, "run.c").write_text(C_LOOP % sizes)
-        command = ["cc", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "run.c", "-o", "run.so", "-lm"]
-        subprocess.run(command, cwd=folder, check=True)
-        library = ctypes.CDLL(f"{folder}/run.so")
-    columns = [np.ascontiguousarray(inputs[name]) for name in ("desired", "wind", "error")]
-    out = np.empty((ticks, sizes["outs"]))
-
-    arrays = [inputs["state"], *columns, out]
-    pointers = [array.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for array in arrays]
-    ours, floor = in_turns(
-        5 * given.turns, partial(run_experiment, settings, 50.0), partial(library.run, *pointers, ticks)
-    )
-    yield Row("a cell of 50 s with its figures, ms", 1e3 * ours, 1e3 * floor, "its ticks in a loop in C")
+    ours = median(seconds_of(partial(run_experiment, settings, 50.0)) for _ in range(5 * given.turns))
+    yield Row("a cell of 50 s with its figures, ms", 1e3 * ours, None, "")
     whole = median(seconds_of(partial(loop.run, "lab", "tables", "--json")) for _ in range(given.turns))
     yield Row("aeroloop lab tables, s", whole, None, "")
 

@@ -129,7 +129,7 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-# ── floors: bare Zenoh between two processes, and bare sleeping, at the loop's rate ──
+# ── the floor: bare Zenoh between two processes at the loop's rate ──
 
 
 def bare_round_trips(seconds: float, rate_hz: float) -> np.ndarray:
@@ -145,7 +145,9 @@ def bare_round_trips(seconds: float, rate_hz: float) -> np.ndarray:
                 ping.put(bytes(7))
                 time.sleep(0.1)
             trips = []
-            for _ in _grid(seconds, rate_hz):
+            start = time.perf_counter()
+            for k in range(1, round(seconds * rate_hz)):
+                time.sleep(max(0.0, start + k / rate_hz - time.perf_counter()))
                 begun = time.perf_counter()
                 ping.put(bytes(7))
                 answers.recv()
@@ -154,19 +156,6 @@ def bare_round_trips(seconds: float, rate_hz: float) -> np.ndarray:
     finally:
         echo.terminate()
         echo.wait()
-
-
-def bare_wake_ups(seconds: float, rate_hz: float) -> np.ndarray:
-    """How late a process wakes that sleeps until each tick [µs]."""
-    return np.array([1e6 * late for late in _grid(seconds, rate_hz)])
-
-
-def _grid(seconds: float, rate_hz: float) -> Iterator[float]:
-    """Absolute deadlines, and how late each was reached [s]."""
-    start = time.perf_counter()
-    for k in range(1, round(seconds * rate_hz)):
-        time.sleep(max(0.0, start + k / rate_hz - time.perf_counter()))
-        yield time.perf_counter() - start - k / rate_hz
 
 
 def answer(endpoint: str) -> None:

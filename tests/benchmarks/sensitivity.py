@@ -9,7 +9,7 @@ eight figures of Table C.4, which scatter as the published cells do about their 
 import numpy as np
 
 from aeroloop.service.config import load
-from aeroloop.service.lab.sweep import open_workers, run_of
+from aeroloop.service.lab.engine import open_workers, run_of
 from aeroloop.service.lab.tables import CASES, OUTPUT_BITS, U_TOTAL, WIND, Z_TRACK, Cell, run_cells
 
 PLANT = load().plant

@@ -158,35 +158,22 @@ def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed
     assert kinds == ["claim", "release"]
 
 
-def test_a_stop_of_the_bridge_holds_in_its_next_process_until_arm() -> None:
-    with Gathering() as gathering:
-        ends = Ends(gathering)
-        assert ends.asker.ask("stop").done
-        ends.close()
-    with Gathering() as gathering:
-        ends = Ends(gathering)
-        try:
-            ends.say(PlantState.IDLE)
-            assert "stopped by an operator: 0 V; `aeroloop op arm` clears it" in ends.asker.refusal()
-            ends.asker.ask("arm")
-            ends.hold()
-        finally:
-            ends.close()
-
-
-@pytest.mark.parametrize("cause", [TripCause.ENVELOPE, None])
-def test_it_trips_when_the_node_has_and_reports_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
+@pytest.mark.parametrize(
+    ("state", "cause", "why"),
+    [
+        (PlantState.TRIPPED, TripCause.ENVELOPE, "tripped: attitude or rate envelope"),
+        (PlantState.TRIPPED, None, "tripped: no cause reported"),
+        (PlantState.IDLE, None, "was started again"),
+    ],
+)
+def test_it_trips_when_the_node_has_left_the_session_and_reports_why(
+    ends: Ends, state: PlantState, cause: TripCause | None, why: str
+) -> None:
     ends.hold()
-    ends.say(PlantState.TRIPPED, cause)
-    assert ends.trip() == f"node 1 tripped: {cause or 'no cause reported'}: 0 V"
+    ends.say(state, cause)
+    assert ends.trip() == f"node 1 {why}: 0 V"
     ends.hold()  # armed by the claim; that the node was tripped before is not held against it
     assert sum(event.kind == "tripped" for event in ends.events) == 1
-
-
-def test_it_trips_when_the_node_knows_nothing_of_the_session_any_more(ends: Ends) -> None:
-    ends.hold()
-    ends.say(PlantState.IDLE)
-    assert ends.trip() == "node 1 was started again: 0 V"
 
 
 def test_it_trips_when_another_node_stands_there_and_refuses_claims_for_it(ends: Ends) -> None:

@@ -1,7 +1,8 @@
-"""CAN link in one process: frames byte for byte, heartbeats, and what is refused or ignored."""
+"""CAN link in one process: frames byte for byte, heartbeats, what is refused or ignored, and faults of the bus."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import isinf
 from typing import Any
 
@@ -10,23 +11,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, Heartbeat
+from aeroloop.protocol.transport.can_format import (
+    COMMAND_ID,
+    MEASUREMENT_ID,
+    PLANT_HEARTBEAT_ID,
+    CanError,
+    CanSettings,
+    Heartbeat,
+)
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual
+from tests.support.can_in_process import PAPER, Flaws, Stranger, both_ends, virtual
 from tests.support.wires import wire_of
 from tests.support.zenoh_network import PATIENCE_S, eventually
 
 MARK = b"\1\2\3\4\5\6\7"
 LENGTHS = [
     pytest.param(PAPER, False, (7, 7), (3, 3), id="8-6"),
-    pytest.param(wire_of(10, 10, 16, 2, 4), False, (8, 8), (5, 5), id="10-16-counter-4"),
-    pytest.param(wire_of(2, 2, 2, 3), False, (3, 3), (2, 2), id="2-2-three-motors"),
-    pytest.param(wire_of(8, 8, 6, 3), True, (7, 7), (4, 4), id="8-6-three-motors-FD"),
     pytest.param(wire_of(10, 10, 6), True, (9, 12), (3, 3), id="10-6"),
-    pytest.param(wire_of(14, 16, 16), True, (13, 16), (5, 5), id="14+16-16"),
     pytest.param(wire_of(16, 16, None, 2, 10), True, (14, 16), (18, 20), id="16-cont-counter-10"),
-    pytest.param(wire_of(None, 8, None, 3), True, (28, 32), (25, 32), id="cont+8-cont-three-motors"),
     pytest.param(wire_of(None, None, 6), True, (49, 64), (3, 3), id="cont-6"),
 ]
 
@@ -95,21 +98,6 @@ def test_a_frame_of_a_wrong_length_or_with_a_pad_that_is_not_zero_is_refused_and
         assert controller.refused == len(wrong) > 0
 
 
-def test_a_refused_frame_neither_replaces_one_that_waits_nor_breaks_the_silence() -> None:
-    with both_ends(virtual()) as (plant, controller, stranger):
-        stranger.say(MEASUREMENT_ID + 1, bytes(6))
-        stranger.say(PLANT_HEARTBEAT_ID + 1, bytes(7))
-        eventually("the refusals", lambda: controller.refused == 2)
-        assert isinf(controller.silent_s())
-        plant.send(b"\x30" + bytes(6))
-        stranger.say(MEASUREMENT_ID + 1, bytes(8))
-        stranger.settle(controller)
-        arrival = controller.take()
-        assert arrival is not None
-        assert arrival.frame == b"\x30" + bytes(6)
-        assert controller.refused == 3
-
-
 FRAME, BEAT = MEASUREMENT_ID + 1, PLANT_HEARTBEAT_ID + 1
 
 
@@ -145,19 +133,95 @@ def next_heartbeat(link: CanLink) -> Heartbeat:
     return received
 
 
-def test_a_malformed_heartbeat_is_refused_and_the_last_one_stands() -> None:
-    malformed = [b"", bytes(7), bytes(12), *(bytes([state]) + bytes(7) for state in range(4, 16))]
-    with both_ends(virtual()) as (_, controller, stranger):
-        stranger.settle(controller)
-        before = controller.peer
-        for data in malformed:
-            stranger.say(PLANT_HEARTBEAT_ID + 1, data)
-        eventually("the refusals", lambda: controller.refused == len(malformed))
-        assert controller.peer is before
+UNSENT = 20
+"""So many frames in a row that are not taken make a fault."""
 
 
-def test_a_link_is_not_opened_for_frames_that_do_not_fit() -> None:
-    with pytest.raises(CanError, match=r"a measurement frame has 10 bytes.*lower wire.attitude.bits"):
-        CanLink(virtual(), wire_of(11, 11, 6), "plant")
-    with pytest.raises(CanError, match=r"a command frame has 17 bytes.*lower wire.voltage.bits"):
-        CanLink(virtual(), wire_of(8, 8, None), "controller")
+@pytest.fixture
+def flawed(flaws: Flaws) -> Iterator[tuple[CanLink, CanSettings]]:
+    del flaws
+    bus = virtual()
+    link = CanLink(bus, PAPER, "plant")
+    yield link, bus
+    link.close()
+
+
+def fill(flaws: Flaws, link: CanLink, frames: int) -> None:
+    flaws.full = True
+    for _ in range(frames):
+        link.send(bytes(7))
+    flaws.full = False
+
+
+def test_a_bus_that_takes_no_frames_is_a_fault_after_so_many_in_a_row(
+    flaws: Flaws, flawed: tuple[CanLink, CanSettings]
+) -> None:
+    link, _ = flawed
+    for _ in range(3):
+        fill(flaws, link, UNSENT - 1)
+        assert link.fault is None
+        link.send(bytes(7))  # one that is taken begins the count anew
+    assert link.errors == 3 * (UNSENT - 1)
+    fill(flaws, link, UNSENT - 1)
+    assert link.fault is None
+    flaws.full = True
+    link.beat(Heartbeat(PlantState.IDLE, 0, MARK))
+    assert link.fault == "the bus takes no frames: transmit queue is full"
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("full", "the bus takes no frames: transmit queue is full"),
+        ("lost", "the bus is lost: adapter was unplugged"),
+        (0x40, "the controller is bus-off"),
+    ],
+)
+def test_after_a_fault_nothing_is_sent_or_raised_until_the_link_is_reopened(
+    flaws: Flaws, flawed: tuple[CanLink, CanSettings], fault: str | int, words: str
+) -> None:
+    link, bus = flawed
+    with Stranger(bus) as stranger:
+        if isinstance(fault, int):
+            stranger.say(fault, bytes(8), is_error_frame=True)
+        elif fault == "full":
+            fill(flaws, link, UNSENT)
+        flaws.lost = fault == "lost"
+        eventually("the fault", lambda: link.fault is not None)
+        assert link.fault == words
+        assert link.errors >= 1
+        flaws.lost = False
+        asked = flaws.sent
+        link.send(bytes(7))
+        link.beat(Heartbeat(PlantState.IDLE, 0, MARK))
+        assert flaws.sent == asked
+        assert link.take() is link.wait(0.01) is None
+        stranger.everything()
+        assert link.reopen()
+        for _ in range(2):
+            fill(flaws, link, UNSENT - 1)  # what was not taken before the fault does not count any more
+            link.send(b"\x20" + bytes(6))
+        assert link.fault is None
+        assert bytes(stranger.receive().data) == b"\x20" + bytes(6)
+        stranger.say(COMMAND_ID + 1, b"\x50\0\0")
+        arrival = link.wait(PATIENCE_S)
+        assert arrival is not None
+        assert arrival.frame == b"\x50\0\0"
+        stranger.settle(link)
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "options"),
+    [
+        pytest.param("slcan", "/dev/no-such-port", {}, id="port"),
+        pytest.param("socketcan", "no-such-can0", {}, id="network-interface"),
+        pytest.param("udp_multicast", "239.74.163.2", {"port": "nonsense"}, id="option-of-a-wrong-type"),
+    ],
+)
+def test_what_cannot_be_opened_is_reported_in_one_line(
+    interface: str, channel: str, options: dict[str, object]
+) -> None:
+    with pytest.raises(CanError) as refusal:
+        CanLink(CanSettings(interface=interface, channel=channel, options=options), PAPER, "plant")
+    assert str(refusal.value).startswith(f"cannot open the CAN bus {interface}:{channel}: ")
+    assert "\n" not in str(refusal.value)

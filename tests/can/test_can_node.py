@@ -80,18 +80,6 @@ def test_another_fingerprint_is_never_followed_and_ends_a_session_that_runs(
     assert bus.endpoint.session is None
 
 
-def test_idle_from_the_other_side_releases_it(bus: Bus) -> None:
-    bus.begin()
-    bus.drive()
-    bus.send_heartbeat(PlantState.IDLE)
-    bus.await_heartbeat(PlantState.IDLE)
-    bus.turn()
-    assert bus.plant.voltages == OFF
-    assert bus.front.link is None
-    bus.begin(number=1)  # it may even be the same number: idle came in between
-    assert bus.counters(1)
-
-
 def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
     bus = hasty_bus
     bus.begin()
@@ -135,35 +123,6 @@ def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus:
     assert bus.endpoint.state is PlantState.TRIPPED, "a release is not an arming"
     bus.begin(number=2)
     bus.await_heartbeat(PlantState.GRANTED, 0)
-
-
-def test_a_node_that_leaves_reports_idle_and_is_at_rest(bus: Bus) -> None:
-    bus.begin()
-    bus.drive()
-    bus.front.leave()
-    bus.stranger.heartbeat(PlantState.IDLE)
-    assert bus.endpoint.session is None
-    sent = bus.side.peer
-    bus.front.leave()
-    assert bus.side.peer is sent
-
-
-def test_a_bus_that_fails_for_a_moment_is_opened_again_and_the_session_goes_on(
-    flaws: Flaws, bus: Bus, caplog: pytest.LogCaptureFixture
-) -> None:
-    bus.begin()
-    bus.drive()
-    opened = flaws.opened
-    bus.stranger.say(0x40, bytes(8), is_error_frame=True)  # bus-off, at both ends
-    bus.until("the fault", lambda: "bus-off" in caplog.text)
-    assert bus.side.reopen()
-    assert flaws.opened == opened + 2
-    bus.stranger.everything()
-    bus.side.peer = None
-    bus.await_heartbeat(PlantState.DRIVEN)
-    assert bus.counters(1)
-    bus.turn_for(0.2)
-    assert bus.endpoint.session == "can-1"
 
 
 def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
 
+import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
-from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.transport.can_format import (
+    COMMAND_ID,
+    HEARTBEAT_S,
+    MEASUREMENT_ID,
+    CanSettings,
+    Heartbeat,
+    fingerprint,
+)
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.figures import Figures, figures
 from aeroloop.service.lab.experiment import run_experiment
-from tests.support.can_closed_loop import lockstep_settings, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
-from tests.support.can_stage import measurement
-from tests.support.plant_end import PERIOD_NS, RecordingPlant
 from tests.support.simulated_link import wire_of
+from tests.support.zenoh_network import PATIENCE_S
 
 POLICIES: list[tuple[Policy, Policy]] = [
     ("on_change", "on_change"),
@@ -29,22 +41,71 @@ POLICIES: list[tuple[Policy, Policy]] = [
 BOTH = wire_of("on_change", "on_change")
 
 
-@pytest.mark.parametrize(
-    ("wire", "fd"),
-    [
-        (WireSpec(), False),
-        (WireSpec().with_bits("12/16"), True),
-        *((wire_of(*policies), False) for policies in POLICIES),
-    ],
-    ids=["classic", "FD", *map("-".join, POLICIES)],
-)
+WIRES = {"classic": WireSpec(), "FD": WireSpec().with_bits("12/16")} | {"-".join(p): wire_of(*p) for p in POLICIES}
+
+
+@pytest.mark.parametrize("interface", ["virtual", "socketcan"])
+@pytest.mark.parametrize("wire", WIRES)
 def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
-    wire: WireSpec, fd: bool, monkeypatch: pytest.MonkeyPatch
+    interface: str, wire: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
-    settings = lockstep_settings(wire)
-    on_bus, direct = run_on_bus(virtual(fd=fd), settings, 0.5), run_experiment(settings, 0.5)
+    bus = virtual(fd=wire == "FD")
+    if interface == "socketcan":
+        if not Path("/sys/class/net/vcan0").exists():
+            pytest.skip("there is no vcan0: modprobe vcan, ip link add vcan0 mtu 72 type vcan, ip link set vcan0 up")
+        bus = CanSettings(interface="socketcan", channel="vcan0", fd=wire == "FD")
+    settings = load(overrides=["loop.lockstep=true"]).model_copy(update={"wire": WIRES[wire]})
+    on_bus, direct = run_on_bus(bus, settings, 0.5), run_experiment(settings, 0.5)
     assert on_bus.model_dump(exclude={"reasons"}) == direct.model_dump(exclude={"reasons"})
+
+
+def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figures:
+    """Run the closed loop for `duration_s` of the law's time [s]. The settings must say lockstep."""
+    loop, wire = settings.loop, settings.wire
+    controller = Controller(wire, settings.law, settings.reference, loop.period)
+    errors, commands = list[Vector](), list[list[float]]()
+    silent = [0, 0]  # measurements and commands without a frame
+    level = wire.voltage.quantizer().level
+    voltages: list[float] = []
+    over = Event()
+    node = Driver(settings.plant.make(loop.period), loop, wire, settings.plant, over)
+    front = CanNetwork(bus, loop, node.endpoint)
+    link = CanLink(bus, wire, "controller", lockstep=True)
+    granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(wire, loop.period_ns, lockstep=True))
+
+    def beat() -> None:
+        while not over.is_set():
+            link.beat(granted)
+            over.wait(HEARTBEAT_S)
+
+    threads = [Thread(target=node.run, args=(front,)), Thread(target=beat)]
+    for thread in threads:
+        thread.start()
+    try:
+        for k in range(loop.ticks(duration_s)):
+            arrival = link.wait(PATIENCE_S)
+            assert arrival is not None, f"no measurement {k}: the node is {node.endpoint.cause or node.endpoint.state}"
+            command = controller.tick(arrival.frame, k)
+            assert command is not None
+            if read := wire.command.unpack(command):
+                voltages = [level(code) for code in read[1]]
+            else:
+                assert command == UNCHANGED
+            errors.append(controller.attitude_error)
+            commands.append(voltages)
+            silent[0] += arrival.frame == UNCHANGED
+            silent[1] += command == UNCHANGED
+            link.send(command)
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+        link.close()
+    ticks = np.arange(len(errors))
+    return figures(
+        wire, loop.period, (ticks, np.array(errors)), (ticks, np.array(commands)), unsent=(silent[0], silent[1])
+    )
 
 
 # The link
@@ -72,26 +133,3 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
             assert (arrival.frame, link.refused) == ((UNCHANGED, 0) if expected else (frame, 1))
     finally:
         link.close()
-
-
-# The node
-
-
-@pytest.fixture(params=[False, True], ids=["real time", "lockstep"])
-def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanNetwork, Stranger, bool]]:
-    """A node's front, a stranger that receives what it sends, and whether it is in lockstep."""
-    bus = virtual()
-    endpoint = Endpoint(RecordingPlant(), BOTH, PERIOD_NS, lockstep=request.param)
-    front = CanNetwork(bus, LoopSettings(lockstep=request.param), endpoint)
-    with Stranger(bus) as stranger:
-        yield front, stranger, request.param
-        front.leave()
-
-
-def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanNetwork, Stranger, bool]) -> None:
-    front, stranger, lockstep = node
-    for frame in (measurement(0), UNCHANGED, UNCHANGED, measurement(3)):
-        front.send(frame)
-    said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
-    silence = [UNCHANGED, UNCHANGED] if lockstep else []
-    assert said == [measurement(0), *silence, measurement(3)]

@@ -1,8 +1,7 @@
 """Third parties: a process that records, watches or operates costs the loop nothing when its link or itself dies.
 
 The ends and the third party are on hosts of their own, network namespaces of this machine. A watchdog of 0.5 s instead
-of 0.1 s allows for a busy machine; before this was mended a dead link stalled the loop for 1 to 2 s. What it costs with
-the default watchdog is measured in `tests/benchmarks/third_parties.py`.
+of 0.1 s allows for a busy machine.
 """
 
 from __future__ import annotations

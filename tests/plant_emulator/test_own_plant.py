@@ -125,8 +125,7 @@ def test_no_voltage_beyond_the_supplys_limit_reaches_it(volts: float, limit: flo
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["plant.ideal=true"], "plant.ideal is for the kinds aero and rigid_body, and plant.kind is"),
-        (["plant.wind.torque=[0, 0.01]"], "plant.wind is for"),
+        (["plant.wind.torque=[0, 0.01]"], "plant.wind is for the kinds aero and rigid_body, and plant.kind is"),
         (["plant.kind=aero", "plant.own.inertia=1"], "plant.own is for a plant of another kind, and plant.kind is"),
     ],
 )
@@ -139,13 +138,3 @@ def test_a_setting_that_would_not_act_is_refused(words: list[str], line: str) ->
 def test_only_the_process_that_runs_it_needs_its_class() -> None:
     settings = load(None, ["plant.kind=nowhere:Table", "plant.own.anything.nested=1"])
     assert settings.plant.own == {"anything": {"nested": 1}}
-
-
-def test_the_environment_gives_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AEROLOOP_PLANT__KIND", TABLE)
-    monkeypatch.setenv("AEROLOOP_PLANT__OWN__INERTIA", "0.25")
-    monkeypatch.setenv("AEROLOOP_PLANT__OWN__PARTS__LEGS", "3")
-    monkeypatch.setenv("AEROLOOP_CAN__OPTIONS__BITRATE", "500000")
-    settings = load()
-    assert settings.plant.own == {"inertia": 0.25, "parts": {"legs": 3}}
-    assert settings.can.options == {"bitrate": 500_000}

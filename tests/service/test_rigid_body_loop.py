@@ -20,6 +20,7 @@ from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from tests.support import numpy_twin as twin
+from tests.support.ideal import IDEAL
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
 
@@ -34,7 +35,7 @@ BODY = (
 OTHER = load(
     overrides=[
         "plant.kind=rigid_body",
-        "plant.ideal=true",
+        *IDEAL,
         "plant.voltage_limit=36",
         "plant.rigid_body.damping=[0.012, 0.008, 0.015]",
         "law.C1=[0.5, 0.6, 0.4]",

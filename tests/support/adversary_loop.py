@@ -24,6 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
+from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO
+
 Array = npt.NDArray[np.float64]
 Motion = tuple[Array, ...]
 """q_d, and ω_d and its derivative in the desired body frame."""
@@ -37,8 +39,8 @@ _AT_ONCE: Final = 1e-3
 def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:
     """The numbers of a configuration; `late` ticks that a command may be late, by lost frames or else by delay."""
     law, wire, plant, sensors = settings.law, settings.wire, settings.plant, settings.plant.sensors
-    paper, held, real, nil = law.kind in ("adaptive", "nonadaptive"), wire.actuators == 2, not plant.ideal, np.zeros(3)
-    gyro, encoders = real and sensors.rate == "gyro", real and sensors.rate == "derivative"
+    paper, held, nil = law.kind in ("adaptive", "nonadaptive"), wire.actuators == 2, np.zeros(3)
+    gyro, encoders = sensors.rate == "gyro", sensors.rate == "derivative"
     return {
         "J": law.inertia, "B": np.array(law.allocation) * [not held, 1, 1],
         "B_inverse": np.linalg.inv(np.array(law.allocation)) * [[not held], [1], [1]],
@@ -51,10 +53,10 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
         "delta_eps": [wire.attitude.quantizer().bound], "delta_u": [wire.voltage.quantizer().bound],
         "delta_omega": [wire.rate.quantizer().bound + gyro * 6 * sensors.gyro_noise],
         "bias": np.array(sensors.gyro_bias) * gyro,
-        "push": [disturbance + real * hypot(*plant.friction.coulomb)],
-        "up": [real * plant.rotor.lag_up_s], "down": [real * plant.rotor.lag_down_s], "held": [held],
+        "push": [disturbance + hypot(*plant.friction.coulomb)],
+        "up": [plant.rotor.lag_up_s], "down": [plant.rotor.lag_down_s], "held": [held],
         "encoders": [encoders], "step": encoders * 2 * np.pi / np.array([np.inf, *sensors.counts]),
-        "bandwidth": [sensors.bandwidth], "ratio": [sensors.damping_ratio], "late": [late], "loss": [loss],
+        "bandwidth": [sensors.bandwidth], "ratio": [DAMPING_RATIO], "late": [late], "loss": [loss],
         "amplitude": np.radians(settings.reference.amplitude), "frequency": settings.reference.frequency,
     }  # fmt: skip
 

@@ -5,29 +5,11 @@
 
 #undef fmi3DoStep
 #undef fmi3InstantiateCoSimulation
-#undef fmi3GetFloat64
 #define fmi3DoStep exported_DoStep
 #define fmi3InstantiateCoSimulation exported_InstantiateCoSimulation
-#define fmi3GetFloat64 exported_GetFloat64
 #include "aero_wrap.c"
 #undef fmi3DoStep
 #undef fmi3InstantiateCoSimulation
-#undef fmi3GetFloat64
-
-enum { ARRAY = 1000 }; /* an array of four, which is the four scalars from FIRST_OF_ARRAY on */
-
-FMI3_Export fmi3Status fmi3GetFloat64(fmi3Instance aero, const fmi3ValueReference vr[], size_t n, fmi3Float64 values[],
-    size_t n_values) {
-  const fmi3ValueReference array[] = {FIRST_OF_ARRAY, FIRST_OF_ARRAY + 1, FIRST_OF_ARRAY + 2, FIRST_OF_ARRAY + 3};
-  for (size_t i = 0; i < n; ++i) {
-    size_t size = vr[i] == ARRAY ? 4 : 1;
-    if (n_values < size) return fmi3Error;
-    exported_GetFloat64(aero, size == 4 ? array : vr + i, size, values, size);
-    values += size;
-    n_values -= size;
-  }
-  return n_values ? fmi3Error : fmi3OK;
-}
 
 FMI3_Export fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
     fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean event_mode, fmi3Boolean early_return,

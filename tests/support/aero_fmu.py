@@ -16,15 +16,14 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import casadi as ca
 import pytest
 
-from aeroloop.plant_emulator.model.emulated import step_function
-from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, PlantSettings
+from aeroloop.plant_emulator.model.emulated import SUBSTEPS, step_function
+from tests.support import ideal
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 if COMPILER is None:
     pytest.skip("no C compiler on PATH to build an FMU with", allow_module_level=True)
 fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: it comes with aeroloop[fmi]")
-PERIOD, SUBSTEPS = 0.002, 2
-IDEAL = PlantSettings(ideal=True, substeps=SUBSTEPS)
+PERIOD = 0.002
 
 _HERE = Path(__file__).parent
 _HEADERS = Path(fmpy.__file__).parent / "c-code"
@@ -37,11 +36,11 @@ _FMI2 = """<?xml version="1.0" encoding="UTF-8"?>
 </fmiModelDescription>"""
 
 
-def fmi3(folder: Path, co_simulation: bool = True) -> Path:
+def fmi3(folder: Path) -> Path:
     """The Aero through `DaeBuilder`.
 
     Inputs u2, u3 [V]; parameters load_pitch, load_yaw [N·m]; outputs pitch, yaw [rad], pitch_rate, yaw_rate [rad/s],
-    q.w…, omega.x…, and the array q, which is the wrapper's, as CasADi exports no arrays.
+    q.w…, omega.x….
     """
     folder.mkdir()
     dae = ca.DaeBuilder("aero")
@@ -57,27 +56,24 @@ def fmi3(folder: Path, co_simulation: bool = True) -> Path:
         dae.export_fmu({"no_warning": True, "with_serialization": False})
     description = (folder / "modelDescription.xml").read_text()
     step = PERIOD / SUBSTEPS
-    if co_simulation:
-        interface = f'<CoSimulation modelIdentifier="aero" fixedInternalStepSize="{step}"/>'
-        description = description.replace("<ModelVariables>", f"{interface}<ModelVariables>")
-    array = '<Float64 name="q" valueReference="1000" causality="output"><Dimension start="4"/></Float64>'
-    description = description.replace("</ModelVariables>", f"{array}</ModelVariables>")
-    library = _compiled(folder, [folder / "aero.c", _HERE / "aero_fmi3.c"], STEP=step, FIRST_OF_ARRAY=9)
+    interface = f'<CoSimulation modelIdentifier="aero" fixedInternalStepSize="{step}"/>'
+    description = description.replace("<ModelVariables>", f"{interface}<ModelVariables>")
+    library = _compiled(folder, [folder / "aero.c", _HERE / "aero_fmi3.c"], STEP=step)
     return _packed(folder, description, {f"binaries/{fmpy.platform_tuple}/{library.name}": library})
 
 
 def _equations() -> ca.Function:
     """ẋ, q and ω of the ideal Aero's state, voltages and loads."""
     x, u, load = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("load", 2)
-    aero = IDEAL.effective.mechanism()
-    outputs = aero.derivative(x, u, load), aero.attitude(x), aero.rate(x)
+    aero = ideal.PLANT.mechanism()
+    outputs = aero.derivative(x, u, load), *aero.outputs(x)[:2]
     return ca.Function("equations", [x, u, load], [ca.vertcat(*outputs)])
 
 
 def fmi2(folder: Path) -> Path:
     """The Aero's period as C code: inputs u2, u3 [V]; outputs q[1]…q[4], rate.x…, pitch, yaw; it fails on request."""
     folder.mkdir()
-    step = step_function(IDEAL.effective.mechanism(), IDEAL_ROTOR, IDEAL_FRICTION, PERIOD, SUBSTEPS)
+    step = step_function(ideal.PLANT.mechanism(), ideal.ROTOR, ideal.FRICTION, PERIOD)
     with chdir(folder):
         step.generate("step.c")
     inputs, loads, settings = ("u2", "u3"), ("load_pitch", "load_yaw"), ("fails_at", "fails_with")

@@ -57,8 +57,8 @@ class Bus:
         self.front.take_inbox()
         arrival = self.front.link.take() if self.front.link else None
         frame = self.endpoint.tick(arrival.frame if arrival else None, self._k)
-        if frame is not None:
-            self.front.send(frame)
+        if frame and self.front.link:
+            self.front.link.send(frame)
         self.front.after_tick(frame, arrival, 0)
         time.sleep(0.001)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 from aeroloop.service.config import Settings, load_over
+from tests.support.ideal import IDEAL
 
 SIGNALS: Final = ("attitude", "rate", "voltage")
 FREE: Final = (
     "plant.kind=rigid_body",
-    "plant.ideal=true",
+    *IDEAL,
     "plant.rigid_body.damping=[0, 0.006, 0.006]",
     "wire.actuators=3",
     "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]",

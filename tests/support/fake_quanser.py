@@ -8,7 +8,7 @@ the expiry. A wrong use raises MisuseError, which no code treats as a failure of
 The board's time is a count of samples. With `realtime` samples fall due on an absolute grid, read or not; without,
 `task_read` lets the next period pass at once. No time passes before the task is started. Not emulated: rotor encoders,
 accelerometer, tachometers and currents, which read 0; more than one task, or a buffer of more than one sample; writer
-tasks, PWM and digital inputs; a clear that fails permanently.
+tasks, PWM and digital inputs, lights; a clear that fails permanently.
 
 `quanser_sdk/` beside this file is the package `quanser` with this board in it, for processes that tests start.
 """
@@ -25,22 +25,19 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from aeroloop.plant_emulator.hosts.quanser_board import COUNTS
 from aeroloop.plant_emulator.plant import State
 from aeroloop.plant_emulator.settings import PlantSettings
-
-BOARDS: Final = {"quanser_aero2_usb": (2048, 2048, 2880, 4096), "quanser_aero_usb": (2048, 2048, 2048, 4096)}
-"""Encoder counts a turn: rotors, pitch, yaw."""
 
 _ENCODERS: Final = range(4)
 _OTHER_INPUTS: Final = (*range(3000, 3003), *range(4000, 4003), *range(14000, 14004))
 _CALLS_KEPT: Final = 10_000
 
-Kind = Literal["analog", "digital", "other"]
+Kind = Literal["analog", "digital"]
 
 _OUTPUTS: Final[dict[Kind, tuple[range, Any, Any, float, float]]] = {
     "analog": (range(2), np.float64, np.float64, -24.0, 24.0),  # voltages of the motors [V]
     "digital": (range(2), np.int8, np.int32, 0, 1),  # amplifiers of the motors
-    "other": (range(11000, 11003), np.float64, np.float64, 0.0, 1.0),  # red, green, blue
 }
 """Channels, types of the values written and of those at expiry, least and largest value."""
 
@@ -63,10 +60,9 @@ class Clock:
 
 
 class BufferOverflowMode:
-    """What happens to samples that are not read in time: two of the interface's five modes."""
+    """What happens to samples that are not read in time: one of the interface's five modes."""
 
     OVERWRITE_ON_OVERFLOW = 1
-    WAIT_ON_OVERFLOW = 3
 
 
 @dataclass
@@ -76,23 +72,17 @@ class Task:
     encoders: list[int]
     other: list[int]
     samples: deque[tuple[list[int], list[float]]] = field(default_factory=lambda: deque(maxlen=1))
-    mode: int = BufferOverflowMode.OVERWRITE_ON_OVERFLOW
+    mode: int = 0
     overflows: int = 0
     running: bool = False
     deleted: bool = False
-
-    @property
-    def waiting(self) -> bool:
-        """Whether the board waits for its reader, and time with it."""
-        return bool(self.samples) and self.mode == BufferOverflowMode.WAIT_ON_OVERFLOW
 
 
 class FakeQuanser:
     """A board with an emulated Aero on it, and the names of the module `quanser.hardware`.
 
     Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started. The
-    documentation is silent on whether reads succeed after the watchdog has expired (`reads_while_expired`), and not
-    every board counts lost samples (`counts_overflows`).
+    documentation is silent on whether reads succeed after the watchdog has expired (`reads_while_expired`).
     """
 
     HILError = HILError
@@ -105,17 +95,17 @@ class FakeQuanser:
         self.HIL: Callable[[], FakeHIL] = lambda: FakeHIL(self)
         self.card_type, self.period, self.realtime = card_type, period, realtime
         self.calls: deque[str] = deque(maxlen=_CALLS_KEPT)
-        self.reads_while_expired = self.counts_overflows = True
-        self._turns = BOARDS[card_type]
-        sensors = {"attitude": "encoders", "counts": self._turns[2:], "rate": "gyro"}
+        self.reads_while_expired = True
+        self._turns = COUNTS[card_type]
+        sensors = {"attitude": "encoders", "counts": self._turns, "rate": "gyro"}
         sensing = settings.sensors.model_copy(update=sensors)
         self._plant = settings.model_copy(update={"sensors": sensing}).build(period)
 
         self.holder: FakeHIL | None = None
         self.task: Task | None = None
-        self.time = self.shorts = 0
-        self.analog, self.enabled, self.leds = [0.0, 0.0], [0, 0], [0.0, 0.0, 0.0]
-        self.outputs: dict[Kind, list[Any]] = {"analog": self.analog, "digital": self.enabled, "other": self.leds}
+        self.time = 0
+        self.analog, self.enabled = [0.0, 0.0], [0, 0]
+        self.outputs: dict[Kind, list[Any]] = {"analog": self.analog, "digital": self.enabled}
         self.at_expiry: dict[Kind, list[Any]] = {}
         self.before_expiry: dict[Kind, list[Any]] = {}
         self.expired = False
@@ -142,10 +132,6 @@ class FakeQuanser:
         assert hasattr(FakeHIL, call), call
         self._failing[call] = n
 
-    def short_next(self, n: int = 1) -> None:
-        """Let the next n `task_read` return without a sample, as those of a stopped task do."""
-        self.shorts = n
-
     def unplug(self) -> None:
         """Disconnect the board from the computer: every call fails from now on, the board runs on."""
         self._unplugged = True
@@ -163,8 +149,6 @@ class FakeQuanser:
         task = self.task
         if task is None or not task.running:
             raise MisuseError("no task runs, so there is no sample to wait for")
-        if task.waiting:
-            return
         self._check_watchdog()
         self._plant.actuate(self.motor_voltages)
         self._plant.advance()
@@ -190,7 +174,7 @@ class FakeQuanser:
         """Record a call and fail it if a test requested that. Samples due by now are taken first."""
         self.calls.append(name)
         if self.realtime and self.task is not None and self.task.running:
-            while time.monotonic_ns() >= self._due_ns() and not self.task.waiting:
+            while time.monotonic_ns() >= self._due_ns():
                 self.step()
         self._check_watchdog()
         _refuse(self._unplugged, "the board is not connected")
@@ -221,7 +205,7 @@ class FakeQuanser:
         pitch = atan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y))  # R = R_z(yaw) R_y(pitch)
         yaw = atan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z))
         for channel, angle in ((2, pitch), (3, yaw)):
-            turn = self._turns[channel]
+            turn = self._turns[channel - 2]
             moved = round(angle / (2 * pi) * turn) - self._raw[channel]
             self._raw[channel] += (moved + turn // 2) % turn - turn // 2  # the joint may turn more than once
 
@@ -238,12 +222,11 @@ class FakeHIL:
         device.called("open")
         strings = isinstance(card_type, str) and isinstance(card_identifier, str)
         _require(strings, "a board is named by two strings")
-        there = card_type == device.card_type and card_identifier.split("@")[0] == "0"
+        there = card_type == device.card_type and card_identifier == "0"
         _refuse(not there, f"there is no {card_type} '{card_identifier}'")
         _require(device.holder is not self, "open is called twice")
         _refuse(device.holder is not None, "the board is in use")
         device.holder = self
-        self._virtual = "@" in card_identifier
 
     def close(self) -> None:
         """Close the board and drop its task. Outputs stay as they are. Nothing happens if it is not open."""
@@ -271,7 +254,6 @@ class FakeHIL:
 
     write_analog = partialmethod(_write, "analog")
     write_digital = partialmethod(_write, "digital")
-    write_other = partialmethod(_write, "other")
 
     def set_encoder_counts(self, channels: Any, n: int, counts: Any, /) -> None:
         self._begin("set_encoder_counts")
@@ -302,13 +284,10 @@ class FakeHIL:
     def task_set_buffer_overflow_mode(self, task: Any, mode: int, /) -> None:
         self._begin("task_set_buffer_overflow_mode", task)
         _require(not task.running, "the overflow mode is set while the task runs")
-        waits = mode == BufferOverflowMode.WAIT_ON_OVERFLOW
-        _refuse(waits and not self._virtual, "only virtual boards can wait for their reader")
         task.mode = mode
 
     def task_get_buffer_overflows(self, task: Any, /) -> int:
         self._begin("task_get_buffer_overflows", task)
-        _refuse(not self._device.counts_overflows, "this board does not count overflows")
         return int(task.overflows)
 
     def task_start(self, task: Any, clock: int, frequency: float, samples: int, /) -> None:
@@ -342,9 +321,6 @@ class FakeHIL:
             sample = task.samples.popleft()
         if failure is not None:
             raise failure
-        if device.shorts:
-            device.shorts -= 1
-            return 0
         _fill(sample, *buffers)
         return 1
 
@@ -373,7 +349,6 @@ class FakeHIL:
 
     watchdog_set_analog_expiration_state = partialmethod(_set_expiration, "analog")
     watchdog_set_digital_expiration_state = partialmethod(_set_expiration, "digital")
-    watchdog_set_other_expiration_state = partialmethod(_set_expiration, "other")
 
     def watchdog_start(self, timeout: float, /) -> None:
         device = self._device

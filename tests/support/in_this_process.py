@@ -1,4 +1,4 @@
-"""An engine without processes: batches run where they are submitted, one after the other."""
+"""An engine without processes: runs happen where they are submitted, one after the other."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from aeroloop.service.lab import burden, laws, sweep, tables
-from aeroloop.service.lab.sweep import Workers
+from aeroloop.service.lab import engine
+from aeroloop.service.lab.engine import Workers
 
 
 class InThisProcess(Executor):
@@ -25,17 +25,16 @@ class InThisProcess(Executor):
         return future
 
 
-def workers_here(count: int = 1, most: int = 1) -> Workers:
-    """Workers in this process; with a count above one their results come in no order."""
-    return Workers(InThisProcess(), count, most)
+def workers_here(cores: int = 1) -> Workers:
+    """Workers in this process; with several cores their results come in no order."""
+    return Workers(InThisProcess(), cores)
+
+
+@contextmanager
+def _here() -> Iterator[Workers]:
+    yield workers_here()
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-
-    @contextmanager
-    def here(engine: str = sweep.PROCESSES) -> Iterator[Workers]:
-        sweep.check_engine(engine)
-        yield workers_here()
-
-    for module in (sweep, tables, burden, laws):
-        monkeypatch.setattr(module, "open_workers", here)
+    """Let studies run in this process instead of on every core."""
+    monkeypatch.setattr(engine, "local_processes", _here)

@@ -13,11 +13,10 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
-from unittest.mock import patch
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
@@ -66,8 +65,14 @@ class Clock:
     def monotonic_ns(self) -> int:
         return self.at(self.now_ns)
 
+    def monotonic(self) -> float:
+        return self.monotonic_ns() * 1e-9
+
     def time_ns(self) -> int:
         return self._wall_ns + self.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
 
 
 class Logged(NamedTuple):
@@ -281,7 +286,7 @@ def made(
     messages = Messages()
     drift = rough.chance.choice([0.0, 1e-4, -5e-5]) if rough else 0.0
     plant_clock, clock = Clock("plant"), Clock("controller", drift)
-    emulator = Emulator(loop, wire, settings.plant, threading.Event())
+    emulator = Driver(settings.plant.make(loop.period), loop, wire, settings.plant, threading.Event())
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
 
     def publish(k: int) -> None:
@@ -295,81 +300,80 @@ def made(
         )  # fmt: skip
         messages.add("status", status.encode(), plant_clock, "plant")
 
-    with patch("aeroloop.plant_emulator.hosts.zenoh_network.time", plant_clock):
-        plant_clock.now_ns = at_ns
-        trace = PlantTrace(
-            loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n
-        )
-        claim = Claim(
-            controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
-        )
-        assert isinstance(endpoint.claim(claim), Grant)
-        trace.follow(endpoint)
-        end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)
-        coming: list[Arrival] = []
-        overtaken: list[tuple[int, bytes]] = []  # measurements that are late
-        resumes = 0
-        for k in range(ticks):
-            if rough and rough.happens(0.004):
-                resumes = k + rough.chance.randrange(20)
-            if k in skipped or k < resumes:
-                continue
-            now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
-            if k in injected:
-                fault = injected[k]
-                emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
-            elif rough and rough.happens(0.004):
-                emulator.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
-                trace.follow(endpoint)
-            arrived = [one for one in coming if one.at_ns <= plant_clock.monotonic_ns()]
-            arrival = arrived[-1] if arrived else None  # the newest wins
-            coming = coming[len(arrived) :]
-            measurement = emulator.tick(arrival.frame if arrival else None, k)
-            assert measurement is not None, endpoint.notices
-            trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
-            if truth_every and k % truth_every == 0 and (truth := emulator.truth()) is not None:
-                messages.add("truth", truth.encode(), plant_clock, "plant")
-            if k % 100 == 0 and (injected or settings.plant.faults):
-                publish(k)
-            taken: bytes | None = None if k in lost else measurement
-            clock.now_ns = now_ns + (rough.takes(ONE_WAY_NS) if rough else ONE_WAY_NS)
+    plant_clock.now_ns = at_ns
+    trace = PlantTrace(
+        loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n, plant_clock
+    )
+    claim = Claim(
+        controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
+    )
+    assert isinstance(endpoint.claim(claim), Grant)
+    trace.follow(endpoint)
+    end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)
+    coming: list[Arrival] = []
+    overtaken: list[tuple[int, bytes]] = []  # measurements that are late
+    resumes = 0
+    for k in range(ticks):
+        if rough and rough.happens(0.004):
+            resumes = k + rough.chance.randrange(20)
+        if k in skipped or k < resumes:
+            continue
+        now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
+        if k in injected:
+            fault = injected[k]
+            emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
+        elif rough and rough.happens(0.004):
+            emulator.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
+            trace.follow(endpoint)
+        arrived = [one for one in coming if one.at_ns <= plant_clock.monotonic_ns()]
+        arrival = arrived[-1] if arrived else None  # the newest wins
+        coming = coming[len(arrived) :]
+        measurement = emulator.tick(arrival.frame if arrival else None, k)
+        assert measurement is not None, endpoint.notices
+        trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
+        if truth_every and k % truth_every == 0 and (truth := emulator.truth()) is not None:
+            messages.add("truth", truth.encode(), plant_clock, "plant")
+        if k % 100 == 0 and (injected or settings.plant.faults):
+            publish(k)
+        taken: bytes | None = None if k in lost else measurement
+        clock.now_ns = now_ns + (rough.takes(ONE_WAY_NS) if rough else ONE_WAY_NS)
+        if rough:
+            rough.measured[k], rough.sent[k] = measurement, plant_clock.monotonic_ns()
+            rough.outcomes.append(endpoint.outcome)
+            if endpoint.outcome is Outcome.ACTED and arrival is not None:
+                rough.acted[endpoint.answered] = arrival.at_ns
+            if overtaken and rough.happens(0.5):
+                end.late(*overtaken.pop(0))
+                rough.late += 1
+            if measurement and rough.happens(0.04):
+                taken = UNCHANGED if wire.transmit.measurement == "on_change" else None
+                overtaken += [(k, measurement)] * rough.happens(0.5)
+        if taken is None:
+            continue
+        if k in changes:
+            end.follow(k, *changes[k])
+        command, received_ns = end.controller.tick(taken, k), clock.monotonic_ns()
+        if rough:
+            rough.commands[k] = command
+            clock.now_ns += rough.takes(200_000)
+        received_as = Received.FRAME if taken else Received.SILENT
+        logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
+        end.record(PlantTick(k, taken, received_as, received_ns, received_ns), logged, clock.monotonic_ns())
+        if k % 10 == 0 and end.controller.tick_index == k:
+            messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
+        if command or (command is not None and loop.lockstep):
+            arrives_ns, copies = plant_clock.at(clock.now_ns + ONE_WAY_NS), 1
             if rough:
-                rough.measured[k], rough.sent[k] = measurement, plant_clock.monotonic_ns()
-                rough.outcomes.append(endpoint.outcome)
-                if endpoint.outcome is Outcome.ACTED and arrival is not None:
-                    rough.acted[endpoint.answered] = arrival.at_ns
-                if overtaken and rough.happens(0.5):
-                    end.late(*overtaken.pop(0))
-                    rough.late += 1
-                if measurement and rough.happens(0.04):
-                    taken = UNCHANGED if wire.transmit.measurement == "on_change" else None
-                    overtaken += [(k, measurement)] * rough.happens(0.5)
-            if taken is None:
-                continue
-            if k in changes:
-                end.follow(k, *changes[k])
-            command, received_ns = end.controller.tick(taken, k), clock.monotonic_ns()
-            if rough:
-                rough.commands[k] = command
-                clock.now_ns += rough.takes(200_000)
-            received_as = Received.FRAME if taken else Received.SILENT
-            logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
-            end.record(PlantTick(k, taken, received_as, received_ns, received_ns), logged, clock.monotonic_ns())
-            if k % 10 == 0 and end.controller.tick_index == k:
-                messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
-            if command or (command is not None and loop.lockstep):
-                arrives_ns, copies = plant_clock.at(clock.now_ns + ONE_WAY_NS), 1
-                if rough:
-                    late_ns = rough.chance.randrange(20 * loop.period_ns) if rough.happens(0.005) else 0
-                    arrives_ns = plant_clock.at(clock.now_ns + rough.takes(ONE_WAY_NS)) + late_ns
-                    arrives_ns = max([arrives_ns, *(one.at_ns + 1 for one in coming)])
-                    copies = rough.chance.choice([0, 2]) if rough.happens(0.05) else 1
-                coming += [Arrival(command, arrives_ns + i) for i in range(copies)]
-        end.publish(final=True)
-        endpoint.release(session)
-        trace.follow(endpoint)
-        if injected or settings.plant.faults:
-            publish(ticks)
+                late_ns = rough.chance.randrange(20 * loop.period_ns) if rough.happens(0.005) else 0
+                arrives_ns = plant_clock.at(clock.now_ns + rough.takes(ONE_WAY_NS)) + late_ns
+                arrives_ns = max([arrives_ns, *(one.at_ns + 1 for one in coming)])
+                copies = rough.chance.choice([0, 2]) if rough.happens(0.05) else 1
+            coming += [Arrival(command, arrives_ns + i) for i in range(copies)]
+    end.publish(final=True)
+    endpoint.release(session)
+    trace.follow(endpoint)
+    if injected or settings.plant.faults:
+        publish(ticks)
     return messages.all
 
 

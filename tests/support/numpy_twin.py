@@ -2,7 +2,7 @@
 
 Nothing here imports the project, so an error must be made twice, in two notations, to go unseen. The law is written
 from the paper's (C.11) and (C.16)–(C.49). The reference is differentiated by hand. The plant does not project the rigid
-body onto its free motions as aero.py does: it keeps all three axes of (C.2) and solves for the torque with which the
+body onto its free motions as bodies.py does: it keeps all three axes of (C.2) and solves for the torque with which the
 mechanism holds the roll.
 
 Vectors have shape (3,), quaternions (4,) with the scalar first.

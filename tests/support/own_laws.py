@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import casadi as ca
 import numpy as np
@@ -142,19 +142,6 @@ class Offset(ExpressionLaw[OffsetSettings]):
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return ca.repmat(now.gains["offset"] - 2, self.actuators, 1), {}
-
-
-class OffsetInPython(PythonLaw[OffsetSettings]):
-    """The same, tick by tick."""
-
-    Settings = OffsetSettings
-    gains = ("offset",)
-
-    def reset(self) -> None:
-        self.state = {}
-
-    def step(self, now: Now[Any]) -> Any:
-        return [now.gains["offset"][0] - 2] * self.actuators
 
 
 class Stubborn(Offset):

@@ -14,14 +14,12 @@ from typing import Self
 from unittest.mock import patch
 
 from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
-from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
+from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
-from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.plant_end import claim_of
 
 RUN = 0x0123_4567_89AB_CDEF
@@ -30,15 +28,19 @@ RUN = 0x0123_4567_89AB_CDEF
 class Wires(Link):
     """Frames on their way to the plant, each due at a tick; the newest that is due is taken."""
 
-    def __init__(self) -> None:
+    def __init__(self, answer: Callable[[bytes], None] = lambda _: None) -> None:
         self.tick = -1
+        self.sent: list[bytes] = []
+        self.answer = answer
         self._due: list[tuple[int, bytes]] = []
 
     def deliver(self, frame: bytes, tick: int) -> None:
         self._due.append((tick, frame))
 
     def send(self, frame: bytes) -> None:
-        """Measurements go to the stage."""
+        """Keep a measurement, and let the test answer it."""
+        self.sent.append(frame)
+        self.answer(frame)
 
     @property
     def pending(self) -> bool:
@@ -97,13 +99,12 @@ class Stage(PlantNetwork):
         super().__init__()
         self.stop = threading.Event()
         self.loop, self.wire = loop, wire
-        self.driver = driver or Emulator(loop, wire, plant, self.stop)
+        self.driver = driver or Driver(plant.make(loop.period), loop, wire, plant, self.stop)
         self.endpoint = self.driver.endpoint
-        self.wires = Wires()
-        self.sent: list[bytes] = []
+        self.wires = Wires(lambda frame: answer(self, frame))
         self._published: deque[bytes] = deque()
         self.trace = PlantTrace(loop, wire, self._published.append, run=RUN)
-        self._between, self._answer, self._skip = between, answer, skip
+        self._between, self._skip = between, skip
         self._claims = 0
         self._ends = 0
 
@@ -113,6 +114,7 @@ class Stage(PlantNetwork):
             patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda *_, **__: Grid(self._skip)),
             patch("aeroloop.plant_emulator.hosts.driver.prepare_process", lambda _: []),
             patch("aeroloop.plant_emulator.hosts.driver.IDLE_WAIT_S", 0.0),
+            patch("aeroloop.plant_emulator.hosts.driver.ANSWER_TIMEOUT_S", -1.0),  # nothing comes by waiting
         ):
             self.driver.run(self)
         return self
@@ -155,11 +157,6 @@ class Stage(PlantNetwork):
         self._between(self)
         self.follow_session()
 
-    def send(self, frame: bytes) -> None:
-        if frame != UNCHANGED or self.loop.lockstep:
-            self.sent.append(frame)
-            self._answer(self, frame)
-
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         self.trace.row(self.endpoint, measurement, arrival, sent_ns)
         self.wires.tick = self.endpoint.ticked
@@ -171,6 +168,9 @@ class Stage(PlantNetwork):
         self.trace.follow(self.endpoint)
         if self.endpoint.session is None:
             self.wires.close()
+
+    def publish_status(self) -> None:
+        """Nobody reads it."""
 
     def leave(self) -> None:
         self.follow_session()

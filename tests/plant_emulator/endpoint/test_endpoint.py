@@ -214,13 +214,6 @@ def test_beyond_an_envelope_it_trips_within_the_tick_and_names_it(
     assert isinstance(endpoint.claim(claim_of("b", auto_arm=False)), Refusal)  # latched, as every trip
 
 
-def test_turning_about_the_vertical_is_no_tilt() -> None:
-    endpoint, plant = driven(LimitSettings(max_tilt_deg=1.0))
-    for k, yaw in enumerate(range(0, 360, 10), start=2):
-        plant.now = turned(yaw, "z")
-        assert endpoint.tick(WIRE.command.pack((k - 1) % COUNTERS, [1, 1]), k) is not None
-
-
 @pytest.mark.parametrize(
     ("limit", "cause"), [("max_saturated_s", TripCause.SATURATION), ("max_invalid_s", TripCause.SENSORS)]
 )

@@ -104,27 +104,12 @@ def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_non
     assert (endpoint.refused, state_of(endpoint)) == (1, PlantState.GRANTED)
 
 
-def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_the_right_answer() -> None:
-    endpoint, plant = claimed(BOTH, lockstep=True)
-    endpoint.tick(command(0), 1)
-    plant.now = turning(nan)
-    endpoint.tick(UNCHANGED, 2)
-    endpoint.tick(invalid(2), 3)
-    endpoint.tick(UNCHANGED, 4)
-    plant.now = turning(0.0)
-    endpoint.tick(UNCHANGED, 5)
-    assert plant.periods == [volts(), volts(), OFF, OFF, OFF]
-    assert state_of(endpoint) is PlantState.DRIVEN
-    endpoint.tick(UNCHANGED, 6)  # answers a valid measurement
-    assert endpoint.trip is TripCause.INVALID_COMMAND
-
-
 # ── in real time, the end of silence may show late that values are valid again ──
 
 
-def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint, RecordingPlant, int]:
+def after_a_failure() -> tuple[Endpoint, RecordingPlant, int]:
     """An endpoint whose measurements had no valid value until tick 9."""
-    endpoint, plant = claimed(wire_of(policy, "on_change"), lockstep=lockstep)
+    endpoint, plant = claimed(BOTH)
     for k in range(1, 11):
         plant.now = turning(nan if 5 <= k < 10 else 0.0)
         endpoint.tick(invalid(k - 1) if 5 <= k - 1 < 10 else command(k - 1), k)
@@ -132,25 +117,10 @@ def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint
 
 
 def test_a_heartbeat_without_a_valid_value_is_forgiven_as_long_as_a_measurement_may_have_been_lost() -> None:
-    endpoint, plant, k = after_a_failure("on_change")
+    endpoint, plant, k = after_a_failure()
     for later in range(HEARTBEAT):
         endpoint.tick(invalid(k + later), k + later + 1)
         assert state_of(endpoint) is PlantState.DRIVEN
         assert plant.periods[-1] == OFF
     endpoint.tick(invalid(k + HEARTBEAT), k + HEARTBEAT + 1)
-    assert endpoint.trip is TripCause.INVALID_COMMAND
-
-
-@pytest.mark.parametrize(("policy", "lockstep"), [("periodic", False), ("on_change", True)])
-def test_it_trips_at_once_where_every_measurement_is_there(policy: Policy, lockstep: bool) -> None:
-    endpoint, _, k = after_a_failure(policy, lockstep=lockstep)
-    endpoint.tick(invalid(k), k + 1)
-    assert endpoint.trip is TripCause.INVALID_COMMAND
-
-
-def test_nothing_is_forgiven_for_what_the_last_session_did_not_measure() -> None:
-    endpoint, _, k = after_a_failure("on_change")
-    claim_again(endpoint)
-    endpoint.tick(None, k + 1)
-    endpoint.tick(invalid(0), k + 2)
     assert endpoint.trip is TripCause.INVALID_COMMAND

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -46,7 +44,6 @@ def operations(batches: list[Batch]) -> list[PlantChange]:
 
 def inject(text: str) -> Callable[[Stage], None]:
     def do(stage: Stage) -> None:
-        assert isinstance(stage.driver, Emulator)
         stage.driver.inject([Fault.parse(text)])
 
     return do
@@ -56,12 +53,12 @@ def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_
     """The controller derives the grid from it; one sent late would put it ticks back."""
 
     def held_up() -> int:
-        return 5 if stage.endpoint.session is not None and not stage.sent else 0
+        return 5 if stage.endpoint.session is not None and not stage.wires.sent else 0
 
     stage = Stage(LOOP, WIRE, PLANT, between=at({4: Stage.claim}), answer=answer, skip=held_up)
     batches = stage.run(20).batches
     assert rows(batches, "tick") == list(range(11, 21))
-    assert [WIRE.measurement.counter(frame) for frame in stage.sent] == list(range(10))
+    assert [WIRE.measurement.counter(frame) for frame in stage.wires.sent] == list(range(10))
     assert stage.skipped == 0  # what was held up is before the session
 
 
@@ -89,7 +86,7 @@ def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
 def test_a_row_holds_what_came_what_was_made_of_it_and_what_was_measured() -> None:
     stage = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim}), answer=answer).run(50)
     batches = stage.batches
-    assert b"".join(stage.sent) == b"".join(batch.columns["measurement"].tobytes() for batch in batches)
+    assert b"".join(stage.wires.sent) == b"".join(batch.columns["measurement"].tobytes() for batch in batches)
     volts = tuple(WIRE.voltage.quantizer().level(code) for code in (3, -3))
     assert [tuple(row) for batch in batches for row in batch.columns["voltages"]] == [OFF] + [volts] * 48
     assert rows(batches, "outcome") == [Outcome.NONE] + [Outcome.ACTED] * 48
@@ -158,32 +155,8 @@ def test_commands_that_a_fault_keeps_back_are_withheld_and_in_their_rows() -> No
     assert operations(batches)[-1] == PlantChange(tick=40, kind="inject", name="command:off@0..0.02")
 
 
-def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> None:
-    seen: dict[int, int] = {}
-
-    def between(stage: Stage) -> None:
-        if stage.endpoint.ticked == 5:
-            stage.endpoint.stop()
-        if stage.endpoint.ticked == 9:
-            stage.endpoint.arm()
-        seen[stage.endpoint.ticked] = len(stage.batches)
-
-    batches = Stage(LOOP, WIRE, PLANT, between=between).run(12).batches
-    assert (seen[5], seen[6], seen[9], seen[10]) == (0, 1, 1, 2)
-    assert [(batch.header.rows, batch.header.session, batch.header.final) for batch in batches] == [(0, "", False)] * 2
-    assert [operation.kind for operation in operations(batches)] == ["stop", "arm"]
-
-
-def test_a_plant_that_is_not_armed_at_its_start_waits_for_an_operator() -> None:
-    stage = Stage(LOOP, WIRE, PLANT.model_copy(update={"armed_at_start": False}))
-    assert isinstance(stage.claim(auto_arm=False), Refusal)
-    assert stage.endpoint.arm()
-    assert isinstance(stage.claim(auto_arm=False), Grant)
-
-
 def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:
     loop = LoopSettings(lockstep=True, realtime="off", trace_s=10)
-    impatient = PLANT.model_copy(update={"answer_timeout_s": 1e-9})
 
     def sometimes(stage: Stage, measurement: bytes) -> None:
         if stage.endpoint.ticked != 20:
@@ -193,7 +166,7 @@ def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:
         if stage.endpoint.session is None:
             stage.claim()
 
-    batches = Stage(loop, WIRE, impatient, between=claim, answer=sometimes).run(40).batches
+    batches = Stage(loop, WIRE, PLANT, between=claim, answer=sometimes).run(40).batches
     assert rows(batches, "tick") == list(range(41))
     expired = operations(batches)[1]
     assert (expired.kind, expired.tick, expired.cause) == ("expire", 20, TripCause.NO_ANSWER)

@@ -13,8 +13,7 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS
-from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS, Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import FaultStatus
 from aeroloop.protocol.messages.trace import Outcome
@@ -52,7 +51,7 @@ class Run(Stage):
         loop = LoopSettings(realtime="off", lockstep=lockstep, trace_s=10)
         plant = PlantSettings(faults=list(faults))
         super().__init__(loop, WIRE, plant, between=before, answer=lambda stage, frame: stage.command(frame, (1, -1)))
-        self.wires = RecordedWires()
+        self.wires = RecordedWires(self.wires.answer)
         self.altered = 0
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
@@ -61,13 +60,8 @@ class Run(Stage):
         super().after_tick(measurement, arrival, sent_ns)
 
     @property
-    def emulator(self) -> Emulator:
-        assert isinstance(self.driver, Emulator)
-        return self.driver
-
-    @property
     def statuses(self) -> list[FaultStatus]:
-        return self.emulator.fault_statuses()
+        return self.driver.fault_statuses()
 
     @property
     def events(self) -> list[Notice]:
@@ -79,7 +73,7 @@ class Run(Stage):
 
 
 def every_fault(when: str) -> list[str]:
-    values = {name: "" if kind.takes == "nothing" else "=0.5" for name, kind in KINDS.items()}
+    values = {kind: "" if kind in ("off", "stuck") else "=0.5" for kind in KINDS}
     return [f"{name}:{kind}{values[kind]}{when}" for name in SIGNALS for kind in SIGNALS[name].kinds]
 
 
@@ -90,7 +84,7 @@ def test_faults_that_are_to_come_change_no_byte_and_leave_every_frame_as_it_arri
     faults = [text for text in every_fault("@1000") if not re.match("motor[3-8]", text)]  # the Aero has two
     for i in range(0, len(faults), MAX_FAULTS):
         run = Run(*faults[i : i + MAX_FAULTS], lockstep=lockstep).run(300)
-        assert run.sent == without.sent
+        assert run.wires.sent == without.wires.sent
         assert run.altered == 0
         for name in ("tick", "session_tick", "sent_as", "received_as", "outcome", "answered", "measurement", "command"):
             assert (run.column(name) == without.column(name)).all(), name
@@ -112,24 +106,6 @@ def test_configured_faults_count_from_the_claim_and_publish_begin_and_end_with_t
     assert {notice.session for notice in run.events} == {"s1"}
     withheld = run.column("tick")[run.column("outcome") == Outcome.WITHHELD]
     assert withheld.tolist() == list(range(begin + 1, begin + 21))  # a row has the command received before its tick
-
-
-def test_injected_faults_count_from_the_injection_and_end_when_they_are_cleared() -> None:
-    def operator(run: Run) -> None:
-        if run.endpoint.ticked == 100:
-            run.emulator.inject([Fault.parse("motor1:bias=0.1@0.01..0.05"), Fault.parse("rate:drop=0.5")])
-        if run.endpoint.ticked == 200:
-            run.emulator.inject([Fault.parse("command:garble=0.5@9")], clear=True)
-
-    run = Run("measurement:off@5", between=operator).run(300)
-    found = [(status.fault, status.begin_tick, status.end_tick) for status in run.statuses]
-    assert found == [
-        ("motor1:bias=0.1@0.01..0.05", 105, 125),
-        ("rate:drop=0.5", 100, 200),
-        ("command:garble=0.5@9", 200 + 4500, None),
-    ]
-    assert run.statuses[0].changed == 20
-    assert [notice.tick for notice in run.events] == [100 - FIRST, 105 - FIRST, 125 - FIRST, 200 - FIRST]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +134,7 @@ def test_frames_held_back_for_a_session_are_lost_with_it() -> None:
     sent: dict[int, int] = {}
 
     def operator(run: Run) -> None:
-        sent[run.endpoint.ticked] = len(run.sent)
+        sent[run.endpoint.ticked] = len(run.wires.sent)
         if run.endpoint.ticked == 100:
             run.endpoint.release("s1")
             run.claim()

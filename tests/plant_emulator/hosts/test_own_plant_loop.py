@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from aeroloop.plant_emulator.hosts.driver import Driver
-from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
+from aeroloop.plant_emulator.hosts.trace import PlantReplay, why_not
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
@@ -48,12 +47,10 @@ def test_one_motor_or_eight_are_driven_and_replayed_byte_for_byte(kind: str, act
     faults = [f"motor{actuators}:stuck@0.02..0.05", "rate.z:noise=0.05@0.03", "attitude:bias=0.1@0.02..0.06"]
     stage = stage_of(kind, wire, {"inertia": 0.01}, faults, lockstep=lockstep).run(TICKS)
     assert stage.endpoint.accepted > TICKS / 2
-    emulator = stage.driver
-    assert isinstance(emulator, Emulator)
-    truth = emulator.truth()
+    truth = stage.driver.truth()
     assert truth is not None
     assert len(truth.voltages) == actuators
-    assert sum(fault.changed for fault in emulator.fault_statuses()) > 0
+    assert sum(fault.changed for fault in stage.driver.fault_statuses()) > 0
     replay = PlantReplay(stage.loop, wire, PlantSettings(kind=f"{HERE}:{kind}", own={"inertia": 0.01}, faults=faults))
     for batch in stage.batches:
         assert batch.header.actuators == actuators
@@ -77,21 +74,6 @@ def test_a_plant_that_fails_trips_is_closed_at_0_v_and_ends_the_loop(method: str
     assert (Turntable.latest.closed, Turntable.latest.volts) == (1, (0.0,))
 
 
-def test_a_failed_plant_is_replayed_up_to_its_failure() -> None:
-    own = {"fails_in": "measure", "fails_after": 30}
-    stage = stage_of("Turntable", WireSpec(actuators=1), own, [], lockstep=False)
-    with pytest.raises(PlantError):
-        stage.run(TICKS)
-    results = []
-    for given in (own, own | {"fails_after": 9}):
-        replay = PlantReplay(stage.loop, stage.wire, PlantSettings(kind=f"{HERE}:Turntable", own=given))
-        for batch in stage.batches:
-            replay.feed(batch)
-        results.append(replay.result())
-    assert (results[0].differ, results[0].stopped) == (0, None)
-    assert "Turntable failed in measure()" in (results[1].stopped or "")
-
-
 @pytest.mark.parametrize(
     ("kind", "wire", "faults", "line"),
     [
@@ -110,15 +92,19 @@ def test_a_plant_that_does_not_fit_is_refused_and_closed(
 
 
 @pytest.mark.parametrize(
-    ("kind", "why"),
-    [("Hardware", "Hardware (plant.kind) does not state that it is `repeatable`"), ("Gone", "has no Gone")],
+    ("plant", "why"),
+    [
+        ({"kind": f"{HERE}:Hardware"}, "Hardware (plant.kind) does not state that it is `repeatable`"),
+        ({"kind": f"{HERE}:Gone"}, "has no Gone"),
+        ({"via": "can"}, "plant.via is 'can'"),
+        ({"via": "quanser"}, "plant.via is 'quanser'"),
+    ],
 )
-def test_a_machine_is_not_moved_by_a_replay(kind: str, why: str) -> None:
-    plant = PlantSettings(kind=f"{HERE}:{kind}")
-    assert why in (why_not(plant) or "")
-    assert why_not(PlantSettings(kind=f"{HERE}:Turntable")) is None
-    with pytest.raises(ValueError, match=r"plant\.kind"):
-        PlantReplay(LoopSettings(), WireSpec(), plant)
+def test_a_machine_is_not_moved_by_a_replay(plant: dict[str, Any], why: str) -> None:
+    settings = PlantSettings(**plant)
+    assert why in (why_not(settings) or "")
+    with pytest.raises(ValueError, match=r"plant\."):
+        PlantReplay(LoopSettings(), WireSpec(), settings)
 
 
 def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,5 +156,5 @@ def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_with
     stage.stop = stop
     before = Node.alive
     stage.run(6000)
-    assert len(stage.sent) > 200  # until no first command came
+    assert len(stage.wires.sent) > 200  # until no first command came
     assert Node.alive - before < 2_000  # of 12 000

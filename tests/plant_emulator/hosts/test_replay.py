@@ -15,8 +15,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
@@ -50,7 +49,7 @@ WIRES = (
     WireSpec(counter_bits=12).with_bits("cont/cont"),
     WireSpec(rate=SignalSpec(bits=6, limit=2.0, kind="hysteresis-uniform"), counter_bits=7),
 )
-PLANT = PlantSettings(wind=WindSettings(blowing=True), answer_timeout_s=1e-9)
+PLANT = PlantSettings(wind=WindSettings(blowing=True))
 
 
 class Mischief:
@@ -96,8 +95,6 @@ class Mischief:
     def between(self, stage: Stage) -> None:
         """Claims, and whatever may end a session or disturb it."""
         random, endpoint = self._random, stage.endpoint
-        emulator = stage.driver
-        assert isinstance(emulator, Emulator)
         if endpoint.session is None:
             if random.random() < 0.2:
                 endpoint.arm()
@@ -115,7 +112,7 @@ class Mischief:
         if random.random() < 0.02 and not self._quiet:
             clear = random.random() < 0.3
             count = random.choice((0, 1, 2) if clear else (1, 1, 2))
-            emulator.inject([Fault.parse(random.choice(FAULTS)) for _ in range(count)], clear=clear)
+            stage.driver.inject([Fault.parse(random.choice(FAULTS)) for _ in range(count)], clear=clear)
 
 
 def traced(seed: int) -> tuple[LoopSettings, WireSpec, PlantSettings, list[Batch]]:
@@ -222,12 +219,3 @@ def test_it_stops_with_the_reason_where_it_cannot_follow() -> None:
     for its_wire, fed, ticks, reason in stops:
         result = replayed(loop, its_wire, PLANT, fed)
         assert (result.ticks, result.differ, result.stopped) == (ticks, 0, reason)
-
-
-@pytest.mark.parametrize("via", ["can", "quanser"])
-def test_a_plant_that_is_not_emulated_is_not_replayed_and_it_is_said_why(via: str) -> None:
-    plant = PLANT.model_copy(update={"via": via})
-    assert why_not(PLANT) is None
-    assert via in (why_not(plant) or "")
-    with pytest.raises(ValueError, match=via):
-        PlantReplay(LoopSettings(), WireSpec(), plant)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,18 +16,15 @@ from pathlib import Path
 import pytest
 
 from aeroloop.plant_emulator.hosts import latch_file
-from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
-from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile, state_directory
-from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.emulator import EmulatorNetwork
+from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Grant, Release, Status
+from aeroloop.protocol.messages.models import Event, Grant, Status
 from aeroloop.protocol.messages.operator import Answer, Request
-from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.runtime.node import Node, OccupiedError
-from aeroloop.protocol.transport.history import RecoveringSubscriber
-from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.plant_end import WIRE, Asker
@@ -36,60 +32,22 @@ from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 LOOP = LoopSettings(realtime="off", rate_hz=100)  # slow, so that a busy machine keeps up
 PLANT = PlantSettings(watchdog_s=1.0, faults=["rate:noise=0.01", "command:drop=0.1"])
-ANSWERED = 60
 
 
 @contextmanager
 def running(
     network: NetworkSettings, vehicle: str = "aero", plant: PlantSettings = PLANT
-) -> Iterator[tuple[Node, EmulatorOnZenoh]]:
+) -> Iterator[tuple[Node, Driver]]:
     """An armed emulator on a network, until the context is left, as SIGTERM ends it."""
     with Node("plant", vehicle, network, {}) as role:
-        emulator = EmulatorOnZenoh(role, LOOP, WIRE, plant)
-        thread = threading.Thread(target=emulator.run)
+        emulator = Driver(plant.make(LOOP.period), LOOP, WIRE, plant, role.stop)
+        thread = threading.Thread(target=emulator.run, args=(EmulatorNetwork(role, LOOP, emulator, plant),))
         thread.start()
         try:
             yield role, emulator
         finally:
             role.stop.set()
             thread.join()
-
-
-def test_a_subscriber_that_joins_after_a_session_recovers_its_trace_and_the_plant_replays() -> None:
-    batches: list[Batch] = []
-    with Gathering() as gathering, running(gathering.settings):
-        zenoh = gathering.join()
-        asker = Asker(zenoh, LOOP.period_ns)
-        eventually("the grant", lambda: isinstance(asker.claim(), Grant))
-        link = ZenohLink(
-            zenoh,
-            send_key=topics.key("command", "aero", session=asker.session),
-            receive_key=topics.key("measurement", "aero", session=asker.session),
-            lengths=WIRE.lengths("measurement", lockstep=False),
-        )
-        for _ in range(ANSWERED):
-            arrival = link.wait(PATIENCE_S)
-            assert arrival is not None
-            counter = WIRE.measurement.counter(arrival.frame)
-            assert counter is not None
-            link.send(WIRE.command.pack(counter, (2, -2)))
-        asker.ask("release", Release(session=asker.session))
-        late = RecoveringSubscriber(zenoh, topics.key("trace", "aero", role="plant"))
-
-        def final() -> bool:
-            found = [read_batch(received.payload) for received in late.take()]
-            batches.extend(batch for batch in found if batch is not None)
-            return any(batch.header.final for batch in batches)
-
-        eventually("the session's last batch", final)
-    replay = PlantReplay(LOOP, WIRE, PLANT)
-    for batch in batches:
-        replay.feed(batch)
-    rows = sum(batch.header.rows for batch in batches)
-    assert replay.result() == PlantReplayed(ticks=rows, differ=0, first_difference=None, stopped=None)
-    outcomes = [outcome for batch in batches for outcome in batch.columns["outcome"].tolist()]
-    assert len(outcomes) >= ANSWERED
-    assert {Outcome.ACTED, Outcome.WITHHELD} <= set(outcomes)
 
 
 def test_a_second_plant_of_a_vehicle_refuses_to_start_and_names_the_first() -> None:
@@ -128,22 +86,13 @@ TRIP = Latch(
 )
 
 
-@contextmanager
-def kept_in(folder: Path) -> Iterator[LatchFile]:
-    file = LatchFile(folder, "aero")
-    try:
-        yield file
-    finally:
-        file.close()
-
-
 def test_the_next_process_finds_the_newest_latch_and_none_after_it_was_cleared(tmp_path: Path) -> None:
     for before, after in ((None, TRIP), (TRIP, STOP), (STOP, None), (None, None)):
-        with kept_in(tmp_path / "state") as file:
-            assert file.found == before
-            file.keep(after)
-            file.wait()
-            assert file.unkept is None
+        file = LatchFile(tmp_path / "state", "aero")
+        assert file.found == before
+        file.keep(after)
+        file.wait()
+        assert file.unkept is None
     assert [*(tmp_path / "state").iterdir()] == []
 
 
@@ -151,10 +100,10 @@ def test_the_next_process_finds_the_newest_latch_and_none_after_it_was_cleared(t
 def test_a_file_that_cannot_be_read_counts_as_a_stop_and_is_named(tmp_path: Path, damage: bytes | None) -> None:
     path = tmp_path / "aero.json"
     path.mkdir() if damage is None else path.write_bytes(damage)
-    with kept_in(tmp_path) as file:
-        assert file.found is not None
-        assert (file.found.cause, file.found.operator_only) == (TripCause.OPERATOR, True)
-        assert str(path) in file.found.text
+    found = LatchFile(tmp_path, "aero").found
+    assert found is not None
+    assert (found.cause, found.operator_only) == (TripCause.OPERATOR, True)
+    assert str(path) in found.text
 
 
 def test_a_full_disk_is_said_leaves_the_file_whole_and_is_tried_again(
@@ -169,27 +118,17 @@ def test_a_full_disk_is_said_leaves_the_file_whole_and_is_tried_again(
 
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(latch_file, "RETRY_S", 0.01)
-    with kept_in(tmp_path) as file:
-        file.keep(TRIP)
-        file.wait()
-        full[0] = True
-        file.keep(STOP)
-        file.wait()
-        assert "No space left on device" in str(file.unkept)
-        assert Latch.model_validate_json(file.path.read_bytes()) == TRIP
-        full[0] = False
-        eventually("another attempt", lambda: file.unkept is None)
-        assert Latch.model_validate_json(file.path.read_bytes()) == STOP
-
-
-def test_the_folder_is_systemds_or_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/aeroloop:/var/lib/other")
-    monkeypatch.setenv("XDG_STATE_HOME", "/home/alice/state")
-    assert state_directory() == Path("/var/lib/aeroloop")
-    monkeypatch.delenv("STATE_DIRECTORY")
-    assert state_directory() == Path("/home/alice/state/aeroloop")
-    monkeypatch.delenv("XDG_STATE_HOME")
-    assert state_directory() == Path("~/.local/state/aeroloop")
+    file = LatchFile(tmp_path, "aero")
+    file.keep(TRIP)
+    file.wait()
+    full[0] = True
+    file.keep(STOP)
+    file.wait()
+    assert "No space left on device" in str(file.unkept)
+    assert Latch.model_validate_json(file.path.read_bytes()) == TRIP
+    full[0] = False
+    eventually("another attempt", lambda: file.unkept is None)
+    assert Latch.model_validate_json(file.path.read_bytes()) == STOP
 
 
 @pytest.fixture(autouse=True)
@@ -240,27 +179,6 @@ class Plant:
         assert self.grants()
         self._role.enqueue(lambda: self.emulator.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
         eventually("the trip", lambda: self.emulator.endpoint.trip is not None)
-
-
-def test_a_stop_holds_in_the_next_process_until_arm_whether_the_plant_was_killed_or_terminated(tmp_path: Path) -> None:
-    with Plant(tmp_path / "terminated") as plant:
-        assert plant.stop().text == "aero is at 0 V; `aeroloop op arm` lets it be driven again"
-        shutil.copytree(tmp_path / "terminated", tmp_path / "killed")  # all that is left if it is killed now
-        since = plant.status().since
-        assert since is not None
-    why = "stopped by an operator (alice@bench): 0 V"
-    for how in ("killed", "terminated"):
-        with Plant(tmp_path / how) as plant:
-            status = plant.status()
-            assert (status.state, status.since) == (PlantState.TRIPPED, since)
-            text = f"{why} ({since:%Y-%m-%d %H:%M:%S} UTC); `aeroloop op arm` clears"
-            eventually("its event", lambda: any(text in event.text for event in plant.events))  # noqa: B023
-            for auto_arm in (True, False):
-                assert plant.asker.refusal(auto_arm=auto_arm) == f"{why}; `aeroloop op arm` clears it"
-            assert plant.arm().done
-            assert plant.grants()
-        with Plant(tmp_path / how) as plant:
-            assert plant.grants()
 
 
 def test_a_trip_holds_in_the_next_process_until_arm_or_a_claim_with_auto_arm(tmp_path: Path) -> None:
@@ -320,15 +238,3 @@ def test_a_plant_that_cannot_keep_a_stop_stops_and_says_so_in_its_answer_and_its
         assert f"but a restart of the plant would forget it: {why}" in answer.text
         assert plant.emulator.endpoint.trip is TripCause.OPERATOR
         assert plant.arm().text == "aero is armed: the next controller to claim it may drive it"
-
-
-def test_a_disk_that_hangs_is_named_in_the_answer_and_in_the_status(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(latch_file, "KEPT_S", 0.1)
-    with Plant(tmp_path) as plant:
-        freed = threading.Event()
-        monkeypatch.setattr(os, "fsync", lambda _: freed.wait(PATIENCE_S))
-        assert "aero.json is not written yet" in plant.stop().text
-        eventually("the status", lambda: "not written yet" in str(plant.status().unkept))
-        freed.set()

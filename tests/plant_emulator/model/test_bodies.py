@@ -10,29 +10,21 @@ from __future__ import annotations
 from itertools import pairwise
 from math import cos, sin
 
-import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.plant_emulator.model.bodies import AeroSettings, RigidBodySettings, aero, rigid_body
+from aeroloop.plant_emulator.model.emulated import SUBSTEPS, EmulatedPlant, step_function
+from tests.support import ideal
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 
 PERIOD = 0.01
-SUBSTEPS = 2
-BARE = PlantSettings(rotor=IDEAL_ROTOR, friction=IDEAL_FRICTION, sensors=IDEAL_SENSORS, substeps=SUBSTEPS)
-"""Nothing acts on a body but its motors, and its sensors are perfect."""
 
 
-def _aero(body: AeroSettings, period: float = PERIOD, substeps: int = SUBSTEPS) -> EmulatedPlant:
-    return BARE.model_copy(update={"aero": body, "substeps": substeps}).build(period)
-
-
-def _free(body: RigidBodySettings, **changed: object) -> EmulatedPlant:
-    return BARE.model_copy(update={"kind": "rigid_body", "rigid_body": body, **changed}).build(PERIOD)
+def _free(body: RigidBodySettings) -> EmulatedPlant:
+    """Nothing acts on it but its motors, and its sensors are perfect."""
+    return ideal.PLANT.model_copy(update={"kind": "rigid_body", "rigid_body": body}).build(PERIOD)
 
 
 def _asymmetric(rng: np.random.Generator) -> dict[str, object]:
@@ -72,8 +64,8 @@ def test_the_aero_agrees_with_lagranges_equations_at_moving_states() -> None:
     random = (
         AeroSettings.model_validate({**_asymmetric(rng), "thrust": rng.normal(size=(2, 2)).tolist()}) for _ in range(20)
     )
-    for p in (IDEAL_AERO, *random):
-        dynamics = aero_dynamics(p)
+    for p in (ideal.AERO, *random):
+        dynamics = aero(p).derivative
         for _ in range(20):
             x, u = rng.normal(size=4), rng.normal(size=2) * 10
             got = np.array(dynamics(x, u, np.zeros(2)), dtype=np.float64).ravel()
@@ -102,10 +94,9 @@ def _equations(p: RigidBodySettings, q: Array, omega: Array, u: Array, tau_d: Ar
 
 def test_the_free_body_agrees_with_the_equations_at_moving_states_under_loads() -> None:
     rng = np.random.default_rng(1)
-    x, u, load = ca.SX.sym("x", 7), ca.SX.sym("u", 3), ca.SX.sym("load", 3)
     for _ in range(20):
         p = RigidBodySettings.model_validate({**_asymmetric(rng), "allocation": rng.normal(size=(3, 3)).tolist()})
-        dynamics = ca.Function("body", [x, u, load], [RigidBody(p).derivative(x, u, load)])
+        dynamics = rigid_body(p).derivative
         for _ in range(20):
             q = rng.normal(size=4)
             q /= np.linalg.norm(q)
@@ -179,11 +170,10 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
     """Fourth order, over a whole period with its substeps."""
 
     def end(substeps: int) -> Array:
-        plant = _aero(IDEAL_AERO, 1.0, substeps)
-        plant.actuate((24.0, -20.0))
+        step, x = step_function(aero(ideal.AERO), ideal.ROTOR, ideal.FRICTION, 1.0, substeps), np.zeros(4)
         for _ in range(3):
-            plant.advance()
-        return np.array([*plant.truth().attitude, *plant.truth().rate])
+            x = np.array(step(x, [24.0, -20.0], [0.0, 0.0])[0]).ravel()
+        return x
 
     exact = end(100)  # its own error is 6⁻⁴, a thousandth, of the finest's below
     errors = [np.linalg.norm(end(substeps) - exact) for substeps in (4, 8, 16)]

@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import asinh, cos, exp, sin, sinh
+from math import exp
 
 import casadi as ca
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
+from aeroloop.plant_emulator.model.bodies import AeroSettings, aero
 from aeroloop.plant_emulator.model.emulated import (
     FrictionSettings,
     RotorSettings,
     friction_torque,
     step_function,
 )
-from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.model.wind import WindSettings
-from aeroloop.plant_emulator.plant import Measurement, State
-from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+from tests.support import ideal
 from tests.support.numpy_twin import Array
 
 PERIOD = 0.002
 WEIGHTLESS = AeroSettings(gravity=0.0, thrust=((0.001, 0.0), (0.0, 0.001)))
 """u₂ is a torque about pitch and u₃ one about yaw, and nothing else acts."""
-BARE = PlantSettings(rotor=IDEAL_ROTOR, friction=IDEAL_FRICTION, sensors=IDEAL_SENSORS)
+BARE = PlantSettings(rotor=ideal.ROTOR, friction=ideal.FRICTION, sensors=ideal.SENSORS)
 """The Aero with every piece off: no lag, no friction, calm, perfect sensors."""
 
 
@@ -47,7 +46,7 @@ ROTOR = RotorSettings(lag_up_s=UP, lag_down_s=DOWN)
 )
 def test_a_rotor_follows_with_the_time_constant_of_the_direction(start: float, command: float, lag: float) -> None:
     """Up is where |thrust| rises, whichever its sign: V(t) = V∞ + (V₀ − V∞) exp(−t/τ)."""
-    step = step_function(Aero(WEIGHTLESS), ROTOR, IDEAL_FRICTION, PERIOD, 2)
+    step = step_function(aero(WEIGHTLESS), ROTOR, ideal.FRICTION, PERIOD)
     x = ca.DM([0.0, 0.0, 0.0, 0.0, 0.0, start])
     for periods in range(1, 251):
         x = step(x, [0.0, command], [0.0, 0.0])[0]
@@ -104,23 +103,6 @@ def test_viscous_friction_is_in_proportion_to_the_rate_and_coulomb_friction_cons
     assert torque(np.full(3, FRICTION.width * np.log(3) / 2)) == pytest.approx(-c / 2, rel=1e-14)
 
 
-@pytest.mark.parametrize("rate", [0.5, -0.5])
-def test_an_axis_slides_down_and_comes_to_rest(rate: float) -> None:
-    """ω̇ = −(c/J) tanh(ω/w) has the solution sinh(ω/w) = sinh(ω₀/w) exp(−c t/(J w))."""
-    c, width, inertia = 0.003, 0.01, 0.02
-    body = RigidBodySettings(inertia=(inertia,) * 3, damping=(0.0, 0.0, 0.0), rate=(0.0, 0.0, rate))
-    friction = FrictionSettings(viscous=(), coulomb=(0.0, 0.0, c), width=width)
-    plant = _with(kind="rigid_body", rigid_body=body, friction=friction).build(PERIOD)
-    stop = abs(rate) * inertia / c  # where a Coulomb torque that does not turn over would have brought it to rest
-    for periods in range(1, round(1.5 * stop / PERIOD)):
-        plant.advance()
-        expected = width * asinh(sinh(rate / width) * exp(-c / (inertia * width) * periods * PERIOD))
-        # (h c/(J w))⁵/120 = 6e-12 of the width a step while it turns over, some 100 steps; rounding of 1e-16·periods
-        assert plant.truth().rate[2] == pytest.approx(expected, abs=1e-11)
-    # By then sinh(ω/w) is ½ exp(ω₀/w − 1.5 ω₀/w): at rest but for 1e-11 of the width.
-    assert abs(plant.truth().rate[2]) < width * exp(-0.5 * abs(rate) / width)
-
-
 # ── supply, start and end ──
 
 
@@ -143,10 +125,9 @@ def test_encoders_on_a_free_body_are_refused_with_what_to_set(attitude: str, rat
     free = {"kind": "rigid_body", "sensors": {"attitude": attitude, "rate": rate}}
     with pytest.raises(ValidationError) as refused:
         PlantSettings.model_validate(free)
-    for word in ("sensors.attitude", "sensors.rate", "'perfect'", "'gyro'", "ideal"):
+    for word in ("sensors.attitude", "sensors.rate", "'perfect'", "'gyro'"):
         assert word in str(refused.value)
     assert PlantSettings.model_validate(free | {"kind": "aero"}).sensors.attitude == attitude
-    assert PlantSettings.model_validate(free | {"ideal": True}).build(PERIOD).actuators == 3
 
 
 @pytest.mark.parametrize(
@@ -166,38 +147,6 @@ def test_a_body_that_cannot_be_is_refused(settings: dict[str, object], names: st
 # ── all together ──
 
 
-def _voltages(k: int) -> tuple[float, ...]:
-    return 12 * sin(0.02 * k), 9 * cos(0.013 * k), 5 * sin(0.05 * k)
-
-
-def _driven(settings: PlantSettings, periods: int = 300) -> list[tuple[State, Measurement]]:
-    """What is true and what is measured, after each period of a drive that goes to and fro."""
-    plant = settings.build(PERIOD)
-    seen = []
-    for k in range(periods):
-        plant.actuate(_voltages(k)[: plant.actuators])
-        plant.advance()
-        seen.append((plant.truth(), plant.measure()))
-    return seen
-
-
-GUSTY = PlantSettings(wind=WindSettings(blowing=True, gust=0.5), rotor=RotorSettings(dead_zone_v=1.0))
-"""Every piece on."""
-
-
-def test_two_plants_of_the_same_settings_move_alike_and_another_seed_changes_its_own_piece_only() -> None:
-    def other_seed(part: BaseModel) -> BaseModel:
-        return part.model_copy(update={"seed": 1})
-
-    states, seen = zip(*_driven(GUSTY), strict=True)
-    assert (states, seen) == tuple(zip(*_driven(GUSTY), strict=True))
-    blown, _ = zip(*_driven(_with(GUSTY, wind=other_seed(GUSTY.wind))), strict=True)
-    assert all(one.attitude != other.attitude for one, other in zip(states, blown, strict=True))
-    same, otherwise = zip(*_driven(_with(GUSTY, sensors=other_seed(GUSTY.sensors))), strict=True)
-    assert same == states
-    assert otherwise != seen
-
-
 def test_wind_is_a_torque_about_the_axes() -> None:
     plant = _with(
         aero=WEIGHTLESS.model_copy(update={"inertia": (0.02, 0.03, 0.05)}),
@@ -208,10 +157,3 @@ def test_wind_is_a_torque_about_the_axes() -> None:
     # constant acceleration, level: Runge–Kutta is exact; rounding of a hundred periods
     assert plant.truth().rate[:2] == (0.0, 0.0)
     assert plant.truth().rate[2] == pytest.approx(0.01 * 0.2 / 0.05, rel=1e-12)
-
-
-def test_the_ideal_plant_has_no_piece_whatever_is_set_and_a_free_one_keeps_its_own_body() -> None:
-    assert _driven(_with(GUSTY, ideal=True, aero=WEIGHTLESS)) == _driven(_with(aero=IDEAL_AERO))
-    body = RigidBodySettings(inertia=(0.01, 0.02, 0.03), rate=(1.0, 2.0, 3.0))
-    ideal = _with(GUSTY, ideal=True, kind="rigid_body", rigid_body=body)
-    assert _driven(ideal) == _driven(_with(kind="rigid_body", rigid_body=body))

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
+from aeroloop.plant_emulator.model.emulated import SUBSTEPS
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from tests.support import ideal
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -69,14 +70,14 @@ def test_the_sign_is_that_of_the_first_error_and_stays() -> None:
 def test_the_closed_loop_agrees_with_the_twins() -> None:
     """Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick."""
     period_ns, reference = round(PERIOD * 1e9), Sinusoid()
-    plant = PlantSettings(ideal=True).build(PERIOD)
+    plant = ideal.PLANT.build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, period_ns, lockstep=True)
     claim = Claim(controller="test", session="loop", period_ns=period_ns, lockstep=True, auto_arm=True, wire=CONTINUOUS)
     assert isinstance(endpoint.claim(claim), Grant)
     controller = Controller(CONTINUOUS, LAW, reference, PERIOD)
     law, theta = body_of(LAW), np.array(LAW.damping_estimate)
     desired = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency)).desired
-    thrust, damping = np.vstack([np.zeros(2), IDEAL_AERO.thrust]), np.array(IDEAL_AERO.damping)
+    thrust, damping = np.vstack([np.zeros(2), ideal.AERO.thrust]), np.array(ideal.AERO.damping)
     body = twin.LockedBody(law, thrust, damping, np.zeros(4))
     q: Array = np.array([1.0, 0.0, 0.0, 0.0])
     sign, limited = 0.0, 0
@@ -102,7 +103,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
         assert read is not None
         assert list(read[1]) == pytest.approx(held, rel=5e-11, abs=5e-11)
         measurement = endpoint.tick(command, k + 1)
-        body.advance(held, PERIOD, PlantSettings().substeps)
+        body.advance(held, PERIOD, SUBSTEPS)
         assert plant.truth().attitude == pytest.approx(body.q, abs=1e-12)
         assert plant.truth().rate == pytest.approx(body.omega, abs=1e-12)
     assert limited > 0  # the start is hard enough to meet the limits, which are part of what is compared

@@ -9,16 +9,17 @@ from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.control.laws.registry import LawError
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
+from tests.support.ideal import IDEAL
 from tests.support.numpy_twin import Sinusoids
 
-IDEAL = load(overrides=["plant.ideal=true"])
+IDEAL_AERO = load(overrides=IDEAL)
 DURATION = 50.0
 """As in the paper, C.5.2 [s]."""
 
 
 @pytest.fixture(scope="module")
 def unquantized() -> Figures:
-    return run_experiment(with_bits(IDEAL, "cont/cont"), DURATION)
+    return run_experiment(with_bits(IDEAL_AERO, "cont/cont"), DURATION)
 
 
 def _score(figures: Figures) -> tuple[float, float]:
@@ -29,7 +30,7 @@ def _score(figures: Figures) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("out", "inp"), [("cont", "cont"), ("8", "6")])
 def test_two_runs_give_the_same_figures_to_the_last_bit(out: str, inp: str) -> None:
-    settings = with_bits(IDEAL, f"{out}/{inp}")
+    settings = with_bits(IDEAL_AERO, f"{out}/{inp}")
     assert run_experiment(settings, 5.0) == run_experiment(settings, 5.0)
 
 
@@ -59,7 +60,7 @@ def test_coarser_outputs_raise_z_track_by_what_quantization_puts_into_the_error(
     eta = np.array([paper.desired(t)[0][0] for t in times])
     step = 2 / (2**bits - 1)
     expected = DURATION * np.mean(step**2 / 12 * (3 + (1 - eta**2) / eta**2))
-    rise = _score(run_experiment(with_bits(IDEAL, f"{bits}/6"), DURATION))[0] - _score(unquantized)[0]
+    rise = _score(run_experiment(with_bits(IDEAL_AERO, f"{bits}/6"), DURATION))[0] - _score(unquantized)[0]
     # Even spread needs a path across many steps: at 8 bits ε₁ and ε₂ cross some 30 steps to and fro, and rest at their
     # crests, which is good for a tenth either way. Quantized rates and voltages shake the body itself a little.
     assert 0.9 * expected < rise < 1.15 * expected
@@ -67,7 +68,7 @@ def test_coarser_outputs_raise_z_track_by_what_quantization_puts_into_the_error(
 
 def test_a_coarser_input_alone_hardly_shows_in_z_track(unquantized: Figures) -> None:
     """As the paper found: quantizing the output matters more."""
-    coarse = run_experiment(with_bits(IDEAL, "cont/6"), DURATION)
+    coarse = run_experiment(with_bits(IDEAL_AERO, "cont/6"), DURATION)
     # Half a step of 6 bits, 0.38 V of both motors, is 1.2 mN·m in yaw and 0.8 mN·m in pitch. Spread evenly, a third of
     # the squares; against the attitude's gain of 1 N·m, an ε̃ᵀε̃ of 7e-7, were it to stay for ever; 50 s of it. (A
     # twenty-fifth of what 8 bits of output do. As it comes and goes it is far less.)
@@ -75,7 +76,7 @@ def test_a_coarser_input_alone_hardly_shows_in_z_track(unquantized: Figures) -> 
 
 
 def test_every_tick_is_judged_and_traffic_is_that_of_the_frames() -> None:
-    quantized = run_experiment(with_bits(IDEAL, "8/6"), 2.0)
+    quantized = run_experiment(with_bits(IDEAL_AERO, "8/6"), 2.0)
     assert quantized.duration_s == 2.0
     assert quantized.skipped_ticks == 0
     assert (quantized.measurement.frames_per_s, quantized.command.frames_per_s) == (500.0, 500.0)

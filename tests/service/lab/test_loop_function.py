@@ -17,6 +17,7 @@ from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.lab import loop_function
 from aeroloop.service.lab.experiment import LoopEndedError, experiment, run_experiment
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
+from tests.support.ideal import PARTS
 
 TICKS = BLOCK + 90
 """More than a block, and not a whole number of blocks."""
@@ -60,7 +61,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
         "plant": st.one_of(
             st.fixed_dictionaries({"sensors": st.fixed_dictionaries(SENSORS)}),
             st.just(BODY | {"sensors": {"attitude": "perfect", "rate": "gyro", "gyro_noise": 0.01}}),
-            st.just({"ideal": True}),
+            st.just(PARTS),
         ),
         "wind": st.fixed_dictionaries({"blowing": st.booleans(), "gust": st.sampled_from([0.0, 0.2])}),
         "voltage_limit": st.sampled_from([24.0, 5.0]),
@@ -72,7 +73,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
 
 def configured(chosen: dict[str, Any]) -> Settings:
     plant = {**chosen["plant"], "wind": chosen["wind"], "voltage_limit": chosen["voltage_limit"]}
-    plant["rotor"] = {"dead_zone_v": chosen["dead_zone_v"]}
+    plant["rotor"] = {**plant.get("rotor", {}), "dead_zone_v": chosen["dead_zone_v"]}
     tree = {"wire": chosen["wire"], "plant": plant, "loop": {"rate_hz": chosen["rate_hz"]}}
     if "kind" in plant:
         tree |= {"law": LAW, "wire": {**chosen["wire"], "actuators": 3}}
@@ -157,7 +158,7 @@ def test_one_function_serves_all_cells_that_differ_in_bits_seeds_and_wind() -> N
         ["plant.limits.max_tilt_deg=5"],
         ["plant.voltage_limit=2", "plant.limits.max_saturated_s=0.1"],
         ["wire.voltage.limit=2", "plant.limits.max_saturated_s=0.1"],
-        ["loop.rate_hz=10", "plant.substeps=1", "plant.limits.max_rate=1e300", "plant.limits.max_tilt_deg=180",
+        ["loop.rate_hz=10", "plant.limits.max_rate=1e300", "plant.limits.max_tilt_deg=180",
          "plant.friction.viscous=[90, 90]"],  # diverges until no number is left
     ],
     ids=["rate", "tilt", "supply", "quantizer", "not a number"],

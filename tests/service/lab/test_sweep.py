@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import resource
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +17,9 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab import sweep as module
 from aeroloop.service.lab.axes import configurations, parse_axes
+from aeroloop.service.lab.engine import COLUMNS, Row, SweepError
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.lab.sweep import COLUMNS, Key, Row, RowFile, Sweep, SweepError, SweepPlan, run_sweep
+from aeroloop.service.lab.sweep import Key, Sweep, SweepPlan, open_rows, run_sweep
 from tests.support.in_this_process import run_here
 
 BENCH = load(overrides=["plant.sensors.rate=gyro", "plant.sensors.gyro_noise=0.01"])
@@ -60,15 +59,6 @@ def test_a_row_has_the_values_the_seed_and_the_figures_of_its_experiment(tmp_pat
     assert len({row["u_total"] for row in rows}) == 4
 
 
-def test_a_csv_file_has_the_same_rows(tmp_path: Path) -> None:
-    _, rows = swept(tmp_path / "a.parquet", BITS)
-    run_sweep(plan(BITS), tmp_path / "a.csv")
-    with (tmp_path / "a.csv").open(newline="") as file:
-        read = list(csv.DictReader(file))
-    assert [float(row["z_track"]) for row in read] == [row["z_track"] for row in rows]
-    assert list(read[0]) == list(rows[0])
-
-
 def test_a_run_that_trips_is_a_row_with_its_reason(tmp_path: Path) -> None:
     limits = "plant.limits.max_rate=0.001,10"
     result, (tripped, fine) = swept(tmp_path / "a.parquet", limits)
@@ -82,7 +72,7 @@ def test_a_sweep_that_gets_more_values_and_seeds_runs_those_alone_and_ends_in_th
     parts, whole = tmp_path / "parts.parquet", tmp_path / "whole.parquet"
     swept(parts, "wire.voltage.bits=6")
     again, _ = swept(parts, "wire.voltage.bits=6")
-    assert (again.done, again.resumed, again.experiments_per_s) == (0, 1, None)
+    assert (again.done, again.resumed, again.failed) == (0, 1, 0)
     more, _ = swept(parts, BITS, seeds=2)
     assert (more.done, more.resumed) == (3, 1)
     swept(whole, BITS, seeds=2)
@@ -109,82 +99,43 @@ def test_each_row_is_in_the_file_before_its_job_counts_as_done(tmp_path: Path) -
     assert counted == [(0, 2, 0), (1, 2, 1), (2, 2, 2)]
 
 
-def test_the_command_prints_what_it_did_and_goes_on_without_force(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_a_table_is_replaced_on_request_only_and_then_resumes(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, suffix: str
 ) -> None:
-    out = tmp_path / "a.parquet"
+    out = tmp_path / f"a.{suffix}"
     command = ["lab", "sweep", "--vary", BITS, "--duration", "0.1", "--out", str(out)]
     assert execute([*command, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["done"] == 2
-    assert execute(command) == 0
+    table = out.read_bytes()
+    assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(out)]) == 2
+    assert "name another file, or replace it with --force" in capfd.readouterr().err
+    assert out.read_bytes() == table
+    assert execute([*command, "--force"]) == 0
     text = capfd.readouterr().out
     assert re.search(r"resumed +2\b", text)
     assert str(out) in "".join(text.split())
-
-
-FLOWN = ("--vary", BITS, "--seeds", "2", "--duration", "0.1")
-
-
-@pytest.mark.parametrize(
-    ("words", "replaces"),
-    [
-        pytest.param(FLOWN, True, id="the same sweep"),
-        pytest.param(("--vary", "wire.voltage.bits=4,6,8", *FLOWN[2:]), True, id="more values"),
-        pytest.param((*FLOWN[:2], "--seeds", "3", *FLOWN[4:]), True, id="more seeds"),
-        pytest.param(("--vary", "wire.rate.bits=8,10", *FLOWN), True, id="a further axis"),
-        pytest.param(("--vary", "wire.voltage.bits=6", *FLOWN[2:]), False, id="fewer values"),
-        pytest.param((*FLOWN[:2], "--seeds", "1", *FLOWN[4:]), False, id="fewer seeds"),
-        pytest.param(("--vary", "wire.rate.bits=8,10", *FLOWN[2:]), False, id="another axis"),
-        pytest.param((*FLOWN, "--set", "law.C2=[0.2, 0.2, 0.2]"), False, id="another base configuration"),
-        pytest.param((*FLOWN[:4], "--duration", "0.2"), False, id="another duration"),
-    ],
-)
-@pytest.mark.parametrize("suffix", ["parquet", "csv"])
-def test_a_table_is_not_replaced_by_another_sweep_without_force(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], replaces: bool, suffix: str
-) -> None:
-    out = tmp_path / f"a.{suffix}"
-    assert execute(["lab", "sweep", *FLOWN, "--out", str(out)]) == 0
-    table = out.read_bytes()
-    assert execute(["lab", "sweep", *words, "--out", str(out)]) == (0 if replaces else 2)
-    assert ("name another file, or replace it with --force" in capfd.readouterr().err) != replaces
-    assert replaces or out.read_bytes() == table
-    assert execute(["lab", "sweep", *words, "--out", str(out), "--force"]) == 0
-
-
-@pytest.mark.parametrize("changed", ["the law's file", "aeroloop"])
-def test_a_table_of_another_version_is_not_replaced_without_force(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
-) -> None:
-    out, law = tmp_path / "a.parquet", tmp_path / "edited_law.py"
-    text = "from tests.support.failing_laws import Runaway\nclass Mine(Runaway):\n    gain = 1.0\n"
-    law.write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    command = ["lab", "sweep", "--duration", "0.1", "--set", "law.kind=edited_law:Mine", "--out", str(out)]
-    assert execute(command) == 0
-    assert execute(command) == 0
-    if changed == "aeroloop":
-        monkeypatch.setattr(module, "code_version", lambda: "0.2.1+other")
-    else:
-        law.write_text(text + "    other = 2.0\n")
-    table = out.read_bytes()
-    assert execute(command) == 2
     assert out.read_bytes() == table
-    assert execute([*command, "--force"]) == 0
+
+
+def test_an_interrupted_sweep_says_where_its_rows_are(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> Row:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "figures_row", interrupt)
+    assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "a.csv")]) == 130
+    assert f"interrupted; what has run is in {tmp_path / 'a.jsonl'}" in capfd.readouterr().err
 
 
 def test_files_of_others_are_left_alone(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    out = tmp_path / "a.parquet"
-    out.write_text("mine")
-    assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(out)]) == 2
-    assert "exists already" in capfd.readouterr().err
-    assert out.read_text() == "mine"
     assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "a.mat")]) == 2
     assert "a .parquet or .csv file" in capfd.readouterr().err
     (tmp_path / "b.jsonl").write_text("mine")
     assert execute(["lab", "sweep", "--duration", "0.1", "--out", str(tmp_path / "b.parquet")]) == 1
     assert "does not hold a sweep" in capfd.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.parquet", "b.jsonl"]
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 # ── the file of rows ──
@@ -203,7 +154,7 @@ ROWS = {
 
 def whole(path: Path) -> bytes:
     """A file of ROWS."""
-    with closing(RowFile(path)) as rows:
+    with open_rows(path) as rows:
         for key, each in ROWS.items():
             rows.append(key, each)
     return path.read_bytes()
@@ -211,7 +162,7 @@ def whole(path: Path) -> bytes:
 
 def found(path: Path) -> dict[Key, Row]:
     """The rows in a file."""
-    with closing(RowFile(path)) as file:
+    with open_rows(path) as file:
         return file.rows
 
 
@@ -226,21 +177,12 @@ def test_a_file_cut_off_anywhere_keeps_its_whole_lines_and_takes_the_others_agai
     length = data.draw(st.integers(0, len(complete)))
     path.write_bytes(complete[:length])
     kept = complete[:length].count(b"\n") - 1  # without the head
-    with closing(RowFile(path)) as rows:
+    with open_rows(path) as rows:
         assert list(rows.rows.items()) == list(ROWS.items())[: max(0, kept)]
         for key, each in ROWS.items():
             if key not in rows.rows:
                 rows.append(key, each)
     assert path.read_bytes() == complete
-
-
-@pytest.mark.parametrize("text", ["hello", "hello\n", '{"seed": 0}\n', '{"aeroloop": "diary"}\n'])
-def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "a.jsonl"
-    path.write_text(text)
-    with pytest.raises(SweepError, match="does not hold a sweep"):
-        RowFile(path)
-    assert path.read_text() == text
 
 
 @pytest.mark.parametrize("line", [b"{}", b"[1]", b"0", b"\x00\x00\xff"])
@@ -249,13 +191,13 @@ def test_a_damaged_line_is_named(tmp_path: Path, line: bytes) -> None:
     lines = whole(path).splitlines()
     path.write_bytes(b"\n".join([*lines[:2], line, *lines[2:], b""]))
     with pytest.raises(SweepError, match="line 3"):
-        RowFile(path)
+        found(path)
 
 
 def test_a_file_serves_one_sweep_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
-    with closing(RowFile(path)), pytest.raises(SweepError, match="in use by another sweep"):
-        RowFile(path)
+    with open_rows(path), pytest.raises(SweepError, match="in use by another sweep"):
+        found(path)
     assert found(path) == {}
 
 
@@ -263,7 +205,7 @@ def test_a_disk_that_takes_half_a_row_ends_the_sweep_and_the_half_is_dropped(tmp
     path = tmp_path / "a.jsonl"
     whole(path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with closing(RowFile(path)) as rows:
+    with open_rows(path) as rows:
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, before[1]))
         try:
             with pytest.raises(SweepError, match="cannot be written"):

@@ -21,7 +21,8 @@ from distributed import Client, LocalCluster
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.axes import configurations, parse_axes
-from aeroloop.service.lab.sweep import Run, Sweep, SweepError, SweepPlan, code_version, open_workers, run_of, run_sweep
+from aeroloop.service.lab.engine import Run, SweepError, code_version, open_workers, run_of
+from aeroloop.service.lab.sweep import Sweep, SweepPlan, run_sweep
 from tests.support.in_this_process import run_here, workers_here
 
 pytestmark = pytest.mark.processes
@@ -70,16 +71,11 @@ def _patience() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-def test_results_come_in_order_whatever_the_size_of_jobs_and_whichever_ends_first() -> None:
-    runs, counted = rates(*range(400, 440)), list[int]()
-    for workers, first in ((workers_here(), 1), (workers_here(2, most=100), 5)):
-        counted.clear()
-        assert workers.rows(partial(rate_over, divisor=2), runs, counted.append) == [
-            rate / 2 for rate in range(400, 440)
-        ]
-        assert counted == list(range(1, 41))
-        sizes = [len(job.results) for job in workers.jobs]
-        assert (max(sizes), min(sizes)) == (first, 1)  # so all workers end at about one time
+def test_results_come_in_the_order_of_the_runs_whichever_ends_first() -> None:
+    counted = list[int]()
+    rows = workers_here(2).rows(partial(rate_over, divisor=2), rates(*range(400, 440)), counted.append)
+    assert rows == [rate / 2 for rate in range(400, 440)]
+    assert counted == list(range(1, 41))
 
 
 @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
@@ -109,7 +105,10 @@ def test_a_sweep_that_is_stopped_runs_only_what_is_missing_and_ends_in_the_same_
 
 
 def test_a_worker_process_that_ends_is_one_line() -> None:
-    with open_workers() as workers, pytest.raises(SweepError, match="a worker process ended in the middle of a job"):
+    with (
+        open_workers() as workers,
+        pytest.raises(SweepError, match="a worker process ended in the middle of an experiment"),
+    ):
         workers.rows(end, rates(400, 500))
 
 
@@ -171,7 +170,7 @@ def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) ->
 
 @pytest.mark.realtime  # a cluster of Dask's own processes
 def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
-    name = "from aeroloop.service.lab import sweep as w; w.code_version ="
+    name = "from aeroloop.service.lab import engine as w; w.code_version ="
     with Client(cluster.scheduler_address, set_as_default=False) as client:
         client.run(exec, f"{name} lambda: '0.2.0+other'", {})
         with pytest.raises(SweepError, match=rf"runs aeroloop 0\.2\.0\+other, this machine {code_version()[:5]}"):

@@ -27,6 +27,7 @@ from aeroloop.service.logs.ticks import Ticks, codes_in, levels, recompute
 from aeroloop.service.review.review import review
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws
+from tests.support.ideal import IDEAL
 from tests.support.made_log import (
     AN_OPERATORS_WORDS,
     RUNS,
@@ -49,7 +50,7 @@ WIRES = {
     "continuous": CONTINUOUS,
     "mixed": ["wire.attitude.bits=cont", "wire.rate.bits=16", "wire.rate.deadzone=0.01", ON_CHANGE],
     "hysteresis": [f"wire.{signal}.kind=hysteresis-uniform" for signal in ("attitude", "rate", "voltage")],
-    "rigid body": ["wire.actuators=3", "plant.kind=rigid_body", "plant.ideal=true", ON_CHANGE],
+    "rigid body": ["wire.actuators=3", "plant.kind=rigid_body", *IDEAL, ON_CHANGE],
 }
 
 

@@ -26,11 +26,12 @@ from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
+from tests.support.ideal import IDEAL
 from tests.support.made_log import SESSION, START_NS, Changes, make_log
 
 TICKS = 600
 CERTIFIED = (
-    "plant.kind=rigid_body", "plant.ideal=true", "plant.rigid_body.damping=[0.006, 0.005, 0.007]", "wire.actuators=3",
+    "plant.kind=rigid_body", *IDEAL, "plant.rigid_body.damping=[0.006, 0.005, 0.007]", "wire.actuators=3",
     "law.damping_bound=0.0119", "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]",
     "law.centre_of_mass=[0, 0, 0]", *(f"wire.{name}.bits=12" for name in ("attitude", "rate", "voltage")),
 )  # fmt: skip
@@ -59,8 +60,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Logs:
     folder = tmp_path_factory.mktemp("theorem")
     known: dict[str, tuple[int, int, Settings]] = {
         # The paper's plant for 1.2 s, with every true state; and for 8 s, in which the attitude errs most.
-        "ideal": (TICKS, 1, lockstep("plant.ideal=true")),
-        "long": (4000, 2, lockstep("plant.ideal=true")),
+        "ideal": (TICKS, 1, lockstep(*IDEAL)),
+        "long": (4000, 2, lockstep(*IDEAL)),
         "certified": (1500, 1, lockstep(*CERTIFIED)),  # it begins at rest while its reference moves
     }
 
@@ -130,7 +131,7 @@ def truth_with(one: Said, later: int = 0, **changed: Any) -> Said:
 def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_path: Path) -> None:
     """Where nothing is quantized the two are equal, and those of neighbouring ticks are not."""
     cont = [f"wire.{name}.bits=cont" for name in ("attitude", "rate", "voltage")]
-    make_log(tmp_path / "a.mcap", 300, settings=lockstep("plant.ideal=true", *cont), truth_every=1)
+    make_log(tmp_path / "a.mcap", 300, settings=lockstep(*IDEAL, *cont), truth_every=1)
     _, exact = judged(tmp_path / "a.mcap")
     assert (exact.outside["C.28"], exact.outside["C.29"]) == (0, 0)
     _, late = judged(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", lambda one: truth_with(one, later=1)))
@@ -217,7 +218,7 @@ def change(tick: int, **parts: Any) -> Change:
 
 def test_what_comes_after_an_operators_change_is_not_judged(tmp_path: Path) -> None:
     changes: Changes = {120: (Gains(C1=(5.0, 5.0, 5.0)), None)}
-    make_log(tmp_path / "a.mcap", TICKS, settings=lockstep("plant.ideal=true"), changes=changes, truth_every=1)
+    make_log(tmp_path / "a.mcap", TICKS, settings=lockstep(*IDEAL), changes=changes, truth_every=1)
     _, theorem = judged(tmp_path / "a.mcap")
     assert (theorem.until_s, theorem.samples, theorem.broken) == (0.24, 120, 0)
     assert theorem.judged + theorem.outside["C.30"] == 120
@@ -253,8 +254,8 @@ def truths_at(*ticks: int, rates: tuple[float, ...] = ()) -> Truths:
     return Truths(k, np.tile([1.0, 0.0, 0.0, 0.0], (len(k), 1)), still)
 
 
-def trial(ticks: Ticks, truths: Truths, *changes: Change, plant: str = "plant.ideal=false") -> TheoremCheck:
-    return check_theorem(load(overrides=["reference.kind=hold", plant]), ticks, truths, changes)
+def trial(ticks: Ticks, truths: Truths, *changes: Change) -> TheoremCheck:
+    return check_theorem(load(overrides=["reference.kind=hold"]), ticks, truths, changes)
 
 
 def held(settings: Settings, **values: float) -> dict[str, Any]:
@@ -265,7 +266,7 @@ def held(settings: Settings, **values: float) -> dict[str, Any]:
 def test_the_descriptions_certificate_is_what_counts_unless_the_session_began_with_other_gains(
     logs: Logs, tmp_path: Path
 ) -> None:
-    settings = lockstep("plant.ideal=true")
+    settings = lockstep(*IDEAL)
     half = held(settings, plant_radius=0.5)
     description = Description(
         protocol=PROTOCOL_VERSION, role="controller", vehicle="aero", host="h", versions={},

@@ -18,6 +18,7 @@ from aeroloop.service.theorem.plant_bounds import plant_bounds
 from tests.support import adversary_loop as loop
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import QUANTITIES, Array, norm, unit
+from tests.support.ideal import IDEAL
 from tests.support.twin_body import body_of
 
 LEAST: Final = 0.1
@@ -68,8 +69,8 @@ AERO: Final = (
     "plant.friction.viscous=[0.0071, 0.022]", "law.damping_estimate=[0.022, 0.0071, 0.022]", "law.damping_bound=0.003",
     "plant.voltage_limit=60",
 )  # fmt: skip
-IDEAL: Final = (
-    "loop.lockstep=true", "plant.ideal=true", "law.damping_bound=0.0135", *swing("0, 10, 60", "0, 0.1, 0.07"),
+HELD_ROLL: Final = (
+    "loop.lockstep=true", *IDEAL, "law.damping_bound=0.0135", *swing("0, 10, 60", "0, 0.1, 0.07"),
 )  # fmt: skip
 ENCODERS: Final = ("plant.sensors.attitude=encoders", "plant.sensors.rate=derivative")
 BODY: Final = (
@@ -104,8 +105,8 @@ CASES: Final = {
     "rotors": Case((*FREE, *bits(12, 12, 12), *rotors(0.02, 0.02), *law("adaptive"))),
     "rotors, up and down": Case((*FREE, *bits(12, 12, 12), *rotors(0.02, 0.03), *law("adaptive"))),
     "slow rotors": Case((*FREE, *bits(12, 12, 12), *rotors(0.1, 0.11), *law("adaptive", *SLOW))),
-    "held roll": Case((*IDEAL, *bits(12, 12, 12), *law("adaptive"))),
-    "held roll, nonadaptive, late": Case((*IDEAL, *bits(10, 10, 10), *law("nonadaptive")), late=1),
+    "held roll": Case((*HELD_ROLL, *bits(12, 12, 12), *law("adaptive"))),
+    "held roll, nonadaptive, late": Case((*HELD_ROLL, *bits(10, 10, 10), *law("nonadaptive")), late=1),
     "held roll, PD, rotors": Case((*AERO, *bits(12, 12, 12), *rotors(0.03, 0.032), *law("pd", hz=500))),
     "held roll, PD, encoders": Case((*AERO, *bits(12, 12, 12), *ENCODERS, *law("pd", hz=500))),
     "held roll, encoders": Case((*AERO, *bits(12, 12, 12), *ENCODERS, *law("adaptive", SLOW[2], hz=500))),

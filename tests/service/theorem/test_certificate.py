@@ -25,6 +25,7 @@ from aeroloop.service.theorem.certificate import RESOLUTION_S, Evaluated, certif
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
 from tests.support import numpy_twin as twin
 from tests.support.certified import FREE, bits, certified_settings
+from tests.support.ideal import IDEAL
 
 PAPER = Settings()
 EXAMPLES = Path(__file__).parents[3] / "service" / "examples"
@@ -192,9 +193,7 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
 
 def test_an_integral_is_disturbed_only_by_what_changes() -> None:
     """2 mN·m of wind that stays, on a free body that hardly turns."""
-    slow = ["plant.ideal=false", "plant.rotor.lag_up_s=0", "plant.rotor.lag_down_s=0", "plant.friction.viscous=[]",
-            "plant.friction.coulomb=[]", "plant.sensors.attitude=perfect", "plant.sensors.rate=perfect",
-            "plant.wind.torque=[0, 0.002, 0]", "plant.wind.gust=0", "reference.frequency=[0, 0.01, 0.005]"]  # fmt: skip
+    slow = ["plant.wind.torque=[0, 0.002, 0]", "plant.wind.gust=0", "reference.frequency=[0, 0.01, 0.005]"]  # fmt: skip
     grown = {}
     for kind in ("pd", "pid"):
         calm, windy = (
@@ -209,7 +208,7 @@ def test_an_integral_is_disturbed_only_by_what_changes() -> None:
 
 
 def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
-    for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), certified_settings(3, 3)):
+    for settings in (with_bits(3, 3), load_over(PAPER, [*IDEAL, *bits(3, 3)]), certified_settings(3, 3)):
         found = certify(settings)
         assert not found.holds
         assert any("saturation" in reason or "range" in reason for reason in found.violated)
@@ -218,7 +217,7 @@ def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
 @pytest.mark.parametrize(
     ("change", "names"),
     [
-        ("plant.ideal=false", "rotors that lag"),
+        ("plant.rotor.lag_up_s=0.154", "rotors that lag"),
         ("wire.rate.limit=0.28", "range: wire.rate.limit"),
         ("wire.attitude.limit=0.7", "range: wire.attitude.limit"),
         ("wire.voltage.limit=1", "saturation: wire.voltage.limit"),
@@ -233,16 +232,15 @@ def test_everything_that_the_proof_presumes_is_required(change: str, names: str)
     """Each of them alone keeps a certificate from holding that holds without."""
     assert certify(certified_settings(12, 12)).holds
     changes = [change]
-    if change == "plant.ideal=false":
-        changes += ["plant.sensors.attitude=perfect", "plant.sensors.rate=perfect", "plant.friction.viscous=[]",
-                    "plant.friction.coulomb=[]"]  # fmt: skip  # the rotors' lag remains
+    if change == "plant.rotor.lag_up_s=0.154":
+        changes.append("plant.rotor.lag_down_s=0.176")
     found = certify(certified_settings(12, 12, *changes))
     assert not found.holds
     assert any(names in reason for reason in found.violated), found.violated
 
 
 def test_a_reference_that_rolls_is_not_certified_where_the_roll_is_held() -> None:
-    gentle = ["plant.ideal=true", "law.damping_bound=0.0232", "reference.kind=hold", *bits(14, 14)]
+    gentle = [*IDEAL, "law.damping_bound=0.0232", "reference.kind=hold", *bits(14, 14)]
     assert certify(load_over(PAPER, [*gentle, "reference.attitude=[0, 5, 10]"])).holds
     assert any(
         "rolls" in reason for reason in certify(load_over(PAPER, [*gentle, "reference.attitude=[5, 5, 10]"])).violated

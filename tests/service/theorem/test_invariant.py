@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.bodies import AeroSettings, aero
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.interface import ExpressionLaw, Now
@@ -294,7 +294,7 @@ def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bound
     x_dot = np.empty_like(x)
     for first in range(0, n, n // 10):
         some, (a, b, c) = slice(first, first + n // 10), theta[first]
-        body = aero_dynamics(AeroSettings(centre_of_mass=law.centre_of_mass, damping=(a, b, c)))
+        body = aero(AeroSettings(centre_of_mass=law.centre_of_mass, damping=(a, b, c))).derivative
         x_dot[some] = np.array(body(x[some].T, u[some, 1:].T, [0, 0])).T
     assert B[0, 0] == 1  # the first motor is fictitious
     later = coordinates(t + step, x + step * x_dot, later_hat)

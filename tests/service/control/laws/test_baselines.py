@@ -20,6 +20,7 @@ from aeroloop.service.control.laws.evaluation import configured_gains, initial_s
 from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin
+from tests.support.ideal import IDEAL
 from tests.support.numpy_twin import Array
 
 BASELINES = [*TUNED, "nonadaptive"]
@@ -234,7 +235,7 @@ BODY = (
 @pytest.mark.parametrize("kind", BASELINES)
 @pytest.mark.parametrize("plant", ["aero", "full turns of a free body"])
 def test_without_quantization_the_ideal_plant_follows_the_reference(kind: str, plant: str) -> None:
-    settings = load(overrides=[f"law.kind={kind}", "plant.ideal=true", *(() if plant == "aero" else BODY)])
+    settings = load(overrides=[f"law.kind={kind}", *IDEAL, *(() if plant == "aero" else BODY)])
     settings = settings.model_copy(update={"wire": settings.wire.with_bits("cont/cont")})
     found = experiment(settings, 30.0)
     assert found.compiled

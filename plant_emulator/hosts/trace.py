@@ -1,0 +1,291 @@
+"""Trace of the plant end: its rows written while it runs, and computed again from a log, byte for byte.
+
+`Driver.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the operations
+between ticks determine every measurement of a plant that is emulated or `repeatable`. A replay starts at the first row
+of the plant's process, where the plant's state is known, and stops at the first missing row.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.plant import PlantError, class_of
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Refusal
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, TraceWriter
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.protocol.runtime.timing import Clock
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
+
+# ── writing ──
+
+
+def plant_row(end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> PlantRow:
+    """Trace row of the last tick; arguments as of `PlantNetwork.after_tick`, `measurement` None if it tripped."""
+    command, received_ns = arrival or (b"", 0)
+    received_as = Sent.NONE
+    if arrival is not None:
+        received_as = Sent.SILENT if command == UNCHANGED else Sent.FRAME
+        if command and len(command) != end.wire.command.size:
+            received_as, command = Sent.MALFORMED, b""
+    return PlantRow(
+        end.ticked,
+        end.session_tick,
+        Sent.NONE if measurement is None else Sent.FRAME if measurement else Sent.SILENT,
+        received_as,
+        end.outcome,
+        0 if end.session or end.trip is None else end.trip.number,
+        end.answered,
+        sent_ns,
+        received_ns,
+        measurement or b"",
+        command,
+        end.voltages,
+    )
+
+
+class PlantTrace:
+    """Trace of the plant end: a row for every tick of a session, and the changes between ticks.
+
+    The owner adds a row after each measurement was sent, and calls `follow` whenever a session may have begun or ended.
+    All waiting rows are published when a session ends; changes outside of sessions at once, without rows. `publish` is
+    called with every batch; `run` is the random number that identifies this process, drawn if None.
+    """
+
+    def __init__(
+        self,
+        loop: LoopSettings,
+        wire: WireSpec,
+        publish: Callable[[bytes], None],
+        run: int | None = None,
+        clock: Clock = time,
+    ) -> None:
+        self._publish, self._clock = publish, clock
+        run = secrets.randbits(64) if run is None else run
+        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
+
+    def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Add the row of the last tick, and publish a batch that is due. Nothing without a session."""
+        if self._writer.session:
+            self._writer.row(plant_row(end, measurement, arrival, sent_ns))
+            if self._writer.due(sent_ns):
+                self._publish_batch(final=False)
+
+    def follow(self, end: VehicleClaim) -> None:
+        """Move the end's changes into the trace; publish everything waiting if its session ended or none runs."""
+        writer = self._writer
+        writer.operations += end.changes
+        end.changes.clear()
+        session = end.session or ""
+        if session != writer.session or not session:
+            self.finish()
+        if session != writer.session:
+            writer.session, writer.record = session, b""
+
+    def record(self, changes: bytes) -> None:
+        """Take over the running session's gains and reference, as `record_json` has them, for later batches."""
+        self._writer.record = changes
+
+    def finish(self) -> None:
+        """Publish everything waiting; the last batch of a session is marked final, with or without rows."""
+        if self._writer.session or not self._writer.empty:
+            self._publish_batch(final=bool(self._writer.session))
+
+    def _publish_batch(self, *, final: bool) -> None:
+        self._publish(self._writer.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=final))
+
+
+# ── computing again ──
+
+_FIELDS: Final = ("session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
+"""Compared columns of a row; the first that differs is reported."""
+
+
+class PlantDifference(BaseModel, frozen=True):
+    """The first row with computed values that differ from the logged ones."""
+
+    tick: int = Field(description="of the plant, since its process started")
+    session: str
+    session_tick: int
+    field: str = Field(description="column of the row")
+    logged: str
+    computed: str
+
+
+class PlantReplayed(BaseModel, frozen=True):
+    """Result of the replay of one process of the plant."""
+
+    ticks: int = Field(description="rows compared")
+    differ: int = Field(description="rows that differ from the logged ones")
+    first_difference: PlantDifference | None
+    stopped: str | None = Field(description="why it ends before the log does; null if it does not")
+
+
+def why_not(plant: PlantSettings) -> str | None:
+    """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class."""
+    if plant.via != "emulator":
+        return f"plant.via is {plant.via!r}: only an emulated plant is computed again"
+    if plant.emulated:
+        return None
+    try:
+        found = class_of(plant.kind)
+    except PluginError as error:
+        return str(error)
+    return None if found.repeatable else f"{found.__name__} (plant.kind) does not state that it is `repeatable`"
+
+
+class _StoppedError(Exception):
+    """The replay ends here, with the reason."""
+
+
+class PlantReplay:
+    """Replays one process of an emulated plant, from its settings and its trace.
+
+    Raises:
+        ValueError: The plant cannot be replayed, with the reason of `why_not`.
+        PlantError: It cannot be made.
+    """
+
+    def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
+        if reason := why_not(plant):
+            raise ValueError(reason)
+        self._driver = Driver(plant.make(loop.period), loop, wire, plant, threading.Event())
+        self._wire = wire
+        self._run: int | None = None
+        self._rows = self._ticks = self._differ = 0
+        self._empty: set[Header] = set()  # of batches without rows
+        self._first: PlantDifference | None = None
+        self._stopped: str | None = "the log has no trace of the plant"
+
+    def feed(self, batch: Batch) -> None:
+        """Replay the next batch of the run. A repeated one, as a restarted recorder receives, is passed over."""
+        header = batch.header
+        if self._run is None:
+            self._run, self._stopped = header.run, None
+        repeated = header.first_row < self._rows or header in self._empty
+        if self._stopped is not None or (repeated and header.run == self._run):
+            return
+        try:
+            self._check(header)
+            self._replay(batch)
+        except (_StoppedError, PlantError) as error:
+            self._stopped = str(error)
+        if header.rows:
+            self._rows = header.first_row + header.rows
+        else:
+            self._empty.add(header)
+
+    def result(self) -> PlantReplayed:
+        """Result so far."""
+        return PlantReplayed(
+            ticks=self._ticks, differ=self._differ, first_difference=self._first, stopped=self._stopped
+        )
+
+    def _check(self, header: Header) -> None:
+        """Raise _StoppedError if a batch does not follow what was replayed."""
+        if header.run != self._run:
+            raise _StoppedError("the plant was started again")
+        wire = self._wire.measurement.size, self._wire.command.size, self._wire.actuators
+        if (header.measurement_bytes, header.command_bytes, header.actuators) != wire:
+            raise _StoppedError("the rows are not of the wire that the description describes")
+        if header.first_row > self._rows:
+            if not self._rows:
+                raise _StoppedError("the log lacks the plant's first row, so the plant's state is not known")
+            raise _StoppedError(
+                f"{header.first_row - self._rows} rows are missing after row {self._rows - 1} of the plant"
+            )
+
+    def _replay(self, batch: Batch) -> None:
+        header, changes = batch.header, deque(batch.tail.operations)
+        rows = np.empty(header.rows, header.row_dtype)
+        for name, column in batch.columns.items():
+            rows[name] = column
+        for row in rows:
+            tick = int(row["tick"])
+            while changes and changes[0].tick < tick:
+                self._change(changes.popleft())
+            if self._driver.endpoint.session != header.session:
+                raise _StoppedError(f"tick {tick} is in a session whose claim is missing")
+            self._compare(header.session, row)
+        for change in changes:
+            self._change(change)
+
+    def _compare(self, session: str, logged: Any) -> None:
+        """Compute a tick again, and compare its row."""
+        frames: dict[int, bytes | None] = {
+            Sent.FRAME: logged["command"].tobytes(),
+            Sent.SILENT: UNCHANGED,
+            Sent.NONE: None,
+        }
+        frame = frames.get(int(logged["received_as"]), bytes(self._wire.command.size + 1))
+        measurement = self._driver.tick(frame, int(logged["tick"]))
+        row = plant_row(self._driver.endpoint, measurement, None, 0)
+        computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]
+        self._ticks += 1
+        differ = [name for name in _FIELDS if logged[name].tobytes() != computed[name].tobytes()]
+        self._differ += bool(differ)
+        if differ and self._first is None:
+            self._first = PlantDifference(
+                tick=int(logged["tick"]),
+                session=session,
+                session_tick=int(logged["session_tick"]),
+                field=differ[0],
+                logged=_text(logged[differ[0]]),
+                computed=_text(computed[differ[0]]),
+            )
+
+    def _change(self, change: PlantChange) -> None:
+        """Advance the plant to a change's tick and apply it."""
+        driver, endpoint = self._driver, self._driver.endpoint
+        if change.cause is TripCause.PLANT:
+            return  # it failed within a tick, which has no row, and its process ended
+        if change.tick > endpoint.ticked:
+            if endpoint.session is not None:
+                raise _StoppedError(f"rows are missing before tick {change.tick}, where a session runs")
+            driver.tick(None, change.tick)
+        name, reason = change.name or "", change.reason or ""
+        match change.kind:
+            case "claim":
+                assert change.claim is not None
+                answer = endpoint.claim(change.claim)
+                if isinstance(answer, Refusal):
+                    raise _StoppedError(f"the claim after tick {change.tick} is refused: {answer.reason}")
+            case "release":
+                endpoint.release(name)
+            case "arm":
+                endpoint.arm()
+            case "lost":
+                endpoint.lost(name)
+            case "stop":
+                assert change.cause is not None
+                endpoint.stop(change.cause, reason)
+            case "expire":
+                assert change.cause is not None
+                endpoint.expire(change.cause, reason)
+            case "inject":
+                driver.inject([Fault.parse(name)] if name else [], clear=not name)
+        endpoint.changes.clear()
+        endpoint.notices.clear()
+
+
+def _text(value: Any) -> str:
+    """A value of a row: voltages, a frame in hexadecimal, or a number."""
+    if isinstance(value, np.ndarray):
+        return " ".join(f"{volts!r} V" for volts in value.tolist())
+    if isinstance(value, np.void):
+        return value.tobytes().hex()
+    return "none" if value == NEVER else str(value)

@@ -1,0 +1,503 @@
+"""Faults: their notation, each kind on values and frames, their time, injection and random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from itertools import chain
+from math import cos, inf, isnan, nan, nextafter, sin, sqrt, ulp
+from statistics import fmean, pstdev
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
+from aeroloop.plant_emulator.faults.language import BY_CHANCE, MAX_DELAY_S, MAX_TIME_S, SIGNALS, Fault, FaultError
+from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.protocol.wire.attitude import Vector
+from tests.support.plant_end import RecordingPlant
+
+PERIOD = 0.1
+LIMIT = 24.0
+
+
+def sample(k: int) -> Measurement:
+    """What is true after k periods: no two are alike, in no component."""
+    return Measurement((cos(0.01 * k), 0.0, 0.0, sin(0.01 * k)), (1.0 * k, 10.0 * k, 100.0 * k))
+
+
+class Stand(RecordingPlant):
+    """Measures the count of its periods."""
+
+    def measure(self) -> Measurement:
+        return sample(len(self.periods))
+
+
+def faulty(
+    *faults: str, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
+) -> tuple[FaultyPlant, Stand]:
+    """A plant with these faults, and what is behind them."""
+    stand = Stand(actuators)
+    plant = FaultyPlant(stand, period, voltage_limit=LIMIT, seed=seed)
+    plant.inject([Fault.parse(fault) for fault in faults], "configured")
+    if started:
+        plant.start()
+    return plant, stand
+
+
+def sensed(*faults: str, ticks: int = 8, seed: int = 0) -> list[Measurement]:
+    plant, _ = faulty(*faults, seed=seed)
+    seen = [plant.measure()]
+    for _ in range(ticks):
+        plant.advance()
+        seen.append(plant.measure())
+    return seen
+
+
+def driven(*faults: str, ticks: int = 8, seed: int = 0) -> list[tuple[float, ...]]:
+    """What the motors have in the periods that begin at 0, 0.1, 0.2, …, commanded (k, −k)."""
+    plant, stand = faulty(*faults, seed=seed)
+    for k in range(ticks):
+        plant.actuate((float(k), float(-k)))
+        plant.advance()
+    return stand.periods
+
+
+def passed(*faults: str, frames: Sequence[bytes | None], seed: int = 0, period: float = PERIOD) -> list[list[bytes]]:
+    """The commands that pass at 0 s, 0.1 s, 0.2 s and so on."""
+    plant, _ = faulty(*faults, seed=seed, period=period)
+    ticks = []
+    for frame in frames:
+        ticks.append(plant.passes("command", frame))
+        plant.advance()
+    return ticks
+
+
+def numbered(count: int) -> list[bytes]:
+    return [k.to_bytes(4, "big") for k in range(count)]
+
+
+def missing(values: Sequence[float]) -> bool:
+    return all(isnan(value) for value in values)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong", "right"),
+    [
+        ("attitude", "it is written", "signal:kind[=value][@start[..end]]"),
+        ("altitude:off", "no signal 'altitude'", "attitude, attitude.x"),
+        ("attitude:of", "takes no 'of'", "off, stuck, bias, noise, delay, drop and garble"),
+        ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise and drop; attitude as a whole does"),
+        ("command:bias=1", "command takes no 'bias'", "off, stuck, delay, drop, garble, duplicate and reorder"),
+        ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
+        ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
+        ("attitude.x:bias=-3.2", "not -3.2", "-3.1416 to 3.1416 rad"),
+        ("motors:bias=1e308", "not 1e+308", "-48 to 48 V"),
+        ("rate:noise=-1", "not -1", "0 to 35 rad/s"),
+        ("rate:delay=10.5", "not 10.5", "0 to 10 s"),
+        ("rate:drop=0", "not 0", "a probability above 0 and up to 1"),
+        ("rate:bias=much", "'much' is not a number", ""),
+        ("rate:off@soon", "'soon' is not a number", ""),
+        ("rate:off@nan", "not at nan s", "within 0 to 1e+08 s"),
+        ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
+        ("rate:off@4..1e9", "not at 1000000000 s", "by 1e+08 s"),
+        ("rate:off\n@1", "takes no 'off\\n'", "off, stuck"),
+    ],
+)
+def test_what_is_no_fault_is_refused_in_a_line_that_names_it_and_what_would_be_one(
+    text: str, wrong: str, right: str
+) -> None:
+    with pytest.raises(FaultError) as refused:
+        Fault.parse(text)
+    line = str(refused.value)
+    assert line.startswith(f"fault {text!r}: ")
+    assert "\n" not in line
+    assert wrong in line
+    assert right in line
+
+
+def range_of(signal: str, kind: str) -> tuple[float, float] | None:
+    """Least and largest value; None for a kind without one."""
+    largest = SIGNALS[signal].largest
+    ranges = {"bias": (-largest, largest), "noise": (0.0, largest), "delay": (0.0, MAX_DELAY_S)}
+    return (ulp(0.0), 1.0) if kind in BY_CHANCE else ranges.get(kind)
+
+
+@st.composite
+def any_fault(draw: st.DrawFn) -> Fault:
+    signal = draw(st.sampled_from(sorted(SIGNALS)))
+    kind = draw(st.sampled_from(SIGNALS[signal].kinds))
+    start = draw(st.floats(0.0, MAX_TIME_S, exclude_max=True))
+    end = draw(st.none() | st.floats(start, MAX_TIME_S, exclude_min=True))
+    within = range_of(signal, kind)
+    value = None if within is None else draw(st.floats(*within))
+    return Fault(signal=signal, kind=kind, value=value, start_s=start, end_s=end)
+
+
+@given(fault=any_fault())
+def test_a_fault_reads_back_the_same_and_just_beyond_its_ranges_is_none(fault: Fault) -> None:
+    assert Fault.parse(str(fault)) == fault
+    within, start = range_of(fault.signal, fault.kind), fault.start_s
+    values = [0.0, 1.0] if within is None else [None, nan, nextafter(within[0], -inf), nextafter(within[1], inf)]
+    wrong: list[tuple[str, float | None]] = [("value", value) for value in values]
+    wrong += [("start_s", t) for t in (-ulp(0.0), nan, inf, MAX_TIME_S + 1)]
+    wrong += [("end_s", t) for t in (start, nan, inf, nextafter(MAX_TIME_S, inf))]
+    for field, value in wrong:
+        with pytest.raises(ValueError, match=r"takes|must"):
+            Fault(**{**asdict(fault), field: value})
+
+
+# ── kinds ──
+
+
+MANY = 10_000
+GONE = nan, nan, nan
+
+
+def between(k: int, start: int, end: int = 100) -> bool:
+    return start <= k < end
+
+
+@pytest.mark.parametrize(
+    ("faults", "rate"),
+    [
+        (["rate:off@0.3..0.6"], lambda k, true: GONE if between(k, 3, 6) else true(k)),
+        (["rate.y:off@0.3..0.6"], lambda k, true: GONE if between(k, 3, 6) else true(k)),
+        (["rate:stuck"], lambda _, true: true(0)),
+        (["rate.y:stuck@0.3..0.6"], lambda k, _: (k, 20 if between(k, 3, 6) else 10 * k, 100 * k)),
+        (["rate:bias=0"], lambda k, true: true(k)),
+        (["rate.y:bias=0.5@0.3"], lambda k, _: (k, 10 * k + 0.5 * between(k, 3), 100 * k)),
+        (["rate:bias=-2@0.6"], lambda k, true: tuple(x - 2 * between(k, 6) for x in true(k))),
+        (["rate:delay=0"], lambda k, true: true(k)),
+        (["rate:delay=0.05"], lambda k, true: true(max(0, k - 1))),  # what was true at the beginning of a period
+        (["rate.x:delay=0.2@0.4..0.7"], lambda k, _: (k - 2 * between(k, 4, 7), 10 * k, 100 * k)),
+        (["rate:drop=1"], lambda *_: GONE),
+        (["rate:bias=1@0.3", "rate:stuck@0.3"], lambda k, true: true(min(k, 2))),  # one after another, in this order
+        (["rate:stuck@0.3", "rate:bias=1@0.3"], lambda k, true: tuple(x + between(k, 3) for x in true(min(k, 2)))),
+    ],
+)
+def test_a_rate_fails_as_written_and_the_attitude_does_not(
+    faults: list[str], rate: Callable[[int, Callable[[int], Vector]], Vector]
+) -> None:
+    seen = sensed(*faults)
+    assert [m.rate for m in seen] == [
+        pytest.approx(rate(k, lambda k: sample(k).rate), abs=0, nan_ok=True) for k in range(9)
+    ]
+    assert [m.attitude for m in seen] == [sample(k).attitude for k in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "reported"),
+    [
+        ("attitude:off@0.3..0.6", lambda k: None if between(k, 3, 6) else k),
+        ("attitude.x:off@0.3..0.6", lambda k: None if between(k, 3, 6) else k),
+        ("attitude:stuck@0.5", lambda k: min(k, 4)),
+        ("attitude:bias=0", lambda k: k),
+        ("attitude:delay=0", lambda k: k),
+        ("attitude:delay=0.3@0.1", lambda k: max(0, k - 3)),  # even from before the fault
+    ],
+)
+def test_an_attitude_fails_as_written_and_the_rate_does_not(fault: str, reported: Callable[[int], int | None]) -> None:
+    for k, m in enumerate(sensed(fault)):
+        of = reported(k)
+        assert missing(m.attitude) if of is None else m.attitude == sample(of).attitude
+        assert m.rate == sample(k).rate
+
+
+@pytest.mark.parametrize(
+    ("signal", "rotation"),
+    [
+        ("attitude.x", (0.3, 0.0, 0.0)),
+        ("attitude.y", (0.0, 0.3, 0.0)),
+        ("attitude.z", (0.0, 0.0, 0.3)),
+        ("attitude", (0.3, 0.3, 0.3)),
+    ],
+)
+def test_a_biased_attitude_is_turned_about_the_bodys_axes(signal: str, rotation: Vector) -> None:
+    """At k = 7 the body has yawed by 0.14 rad, so that its axes and the inertial ones differ."""
+    q = Rotation.from_quat(sample(7).attitude, scalar_first=True) * Rotation.from_rotvec(rotation)
+    seen = sensed(f"{signal}:bias=0.3", ticks=7)[7]
+    assert seen.attitude == pytest.approx(q.as_quat(scalar_first=True).tolist(), abs=1e-15)
+
+
+@pytest.mark.parametrize(("signal", "noise"), [("rate.y", 0.2), ("motor2", 0.3)])
+def test_noise_has_the_deviation_it_was_given(signal: str, noise: float) -> None:
+    """Of n samples, mean and deviation lie within 5 of their standard errors σ/√n and σ/√2n."""
+    fault = f"{signal}:noise={noise}"
+    if signal == "motor2":
+        added = [u[1] + k for k, u in enumerate(driven(fault, ticks=MANY))]
+    else:
+        added = [m.rate[1] - sample(k).rate[1] for k, m in enumerate(sensed(fault, ticks=MANY))]
+    assert fmean(added) == pytest.approx(0.0, abs=5 * noise / sqrt(MANY))
+    assert pstdev(added) == pytest.approx(noise, abs=5 * noise / sqrt(2 * MANY))
+
+
+# ── motors ──
+
+
+@pytest.mark.parametrize(
+    ("faults", "voltages"),
+    [
+        (["motor2:off@0.3..0.6"], lambda k: (k, 0 if between(k, 3, 6) else -k)),
+        (["motors:off@0.3..0.6"], lambda k: (0, 0) if between(k, 3, 6) else (k, -k)),
+        (["motor1:stuck@0.3..0.6"], lambda k: (2 if between(k, 3, 6) else k, -k)),
+        (["motors:stuck@0.3"], lambda k: (min(k, 2), -min(k, 2))),
+        (["motor1:bias=0.5@0.3", "motors:bias=-1@0.6"], lambda k: (k + 0.5 * (k >= 3) - (k >= 6), -k - (k >= 6))),
+        (["motor1:delay=0.2@0.4"], lambda k: (k - 2 if k >= 4 else k, -k)),
+        (["motors:delay=0.3"], lambda k: (max(0, k - 3), -max(0, k - 3))),
+    ],
+)
+def test_a_motor_fails_as_written(faults: list[str], voltages: Callable[[int], tuple[float, float]]) -> None:
+    assert driven(*faults) == [voltages(k) for k in range(8)]
+
+
+# ── frames ──
+
+
+@pytest.mark.parametrize(
+    ("faults", "frames", "ticks"),
+    [
+        ([], ["a", "", "b"], ["a", "", "b"]),
+        (["off@0.2..0.4"], "abcdef", ["a", "b", "", "", "e", "f"]),
+        (["stuck@0.2..0.5"], ["a", "b", "c", "", "e", "f"], ["a", "b", "b", "", "b", "f"]),
+        (["stuck"], "abc", ["a", "a", "a"]),
+        (["delay=0.2"], "abcde", ["", "", "a", "b", "c"]),
+        (["delay=0.05"], "abc", ["", "a", "b"]),
+        (["delay=0.2@0.1..0.4"], "abcdef", ["a", "", "", "b", "cde", "f"]),  # what is on its way comes at once, first
+        (["duplicate=1@0.1..0.3"], [*"abcd", ""], ["a", "b", "bc", "cd", ""]),
+        (["duplicate=1"], ["a", "", ""], ["a", "a", ""]),
+        (["reorder=1"], "abcd", ["", "ba", "", "dc"]),
+        (["reorder=1@0.1..0.2"], ["a", "b", "", "d", "e"], ["a", "", "", "db", "e"]),
+        (["duplicate=1", "delay=0.1"], ["a", "", ""], ["", "a", "a"]),  # one after another, in this order
+        (["delay=0.1", "off@0.1"], "abc", ["", "", ""]),
+    ],
+)
+def test_frames_pass_as_written(faults: list[str], frames: Sequence[str], ticks: list[str]) -> None:
+    seen = passed(*(f"command:{fault}" for fault in faults), frames=[frame.encode() or None for frame in frames])
+    assert [b"".join(tick).decode() for tick in seen] == ticks
+
+
+@given(delay_ms=st.integers(0, 30), start=st.integers(0, 40), length=st.integers(1, 40))
+def test_every_frame_passes_a_delay_once_and_in_order_and_none_too_late(delay_ms: int, start: int, length: int) -> None:
+    text = f"command:delay={delay_ms / 1000}@{start / 1000}..{(start + length) / 1000}"
+    frames = numbered(60)
+    ticks = passed(text, frames=[*frames, *[None] * 60], period=0.001)
+    assert list(chain(*ticks)) == frames
+    for k, tick in enumerate(ticks):
+        for frame in tick:
+            sent = int.from_bytes(frame, "big")
+            due = sent + delay_ms if start <= sent < start + length else sent
+            assert k == min(due, max(sent, start + length))
+
+
+@pytest.mark.parametrize("kind", ["drop", "garble", "duplicate", "reorder"])
+def test_a_fifth_of_the_frames_fails_and_the_others_pass_as_they_are(kind: str) -> None:
+    """Five binomial deviations of 40. Of n that could be held back, n·p/(1 + p) = 1667 change places."""
+    frames = numbered(MANY)
+    ticks = passed(f"command:{kind}=0.2@0..999.9", frames=frames)
+    whole = list(chain(*ticks))
+    if kind == "drop":
+        assert abs(sum(not tick for tick in ticks) - 2000) <= 200
+        assert all(tick in ([], [frame]) for tick, frame in zip(ticks, frames, strict=True))
+    elif kind == "garble":
+        assert abs(sum(tick != [frame] for tick, frame in zip(ticks, frames, strict=True)) - 2000) <= 200
+    elif kind == "duplicate":
+        assert abs(len(whole) - 12_000) <= 200
+        assert sorted(set(whole)) == frames
+    else:
+        assert sorted(whole) == frames  # nothing is lost or repeated
+        assert abs(sum(len(tick) == 2 for tick in ticks) - 1667) <= 200
+        assert all(tick[0] > tick[1] for tick in ticks if len(tick) == 2)
+
+
+def test_a_garbled_frame_differs_in_exactly_one_bit_and_in_any() -> None:
+    frame = bytes(range(3))
+    flips = set()
+    for (garbled,) in passed("command:garble=1", frames=[frame] * 500):
+        difference = int.from_bytes(garbled, "big") ^ int.from_bytes(frame, "big")
+        assert len(garbled) == 3
+        assert difference.bit_count() == 1
+        flips.add(difference)
+    assert len(flips) == 24  # that a bit is spared 500 times has probability (23/24)^500 = 6e-10
+    assert passed("command:garble=1", frames=[b""]) == [[b""]]
+
+
+def inject(plant: FaultyPlant, *faults: str, clear: bool = False) -> list[tuple[int, str]]:
+    ends = plant.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
+    return [(end.tick, end.text) for end in ends]
+
+
+# ── begin and end ──
+
+
+@given(
+    period=st.sampled_from((0.002, 0.009, 1 / 300, 0.1)),
+    start=st.integers(0, 300),
+    length=st.none() | st.integers(1, 300),
+)
+def test_a_fault_acts_at_the_ticks_of_its_status_and_events_and_at_no_other(
+    period: float, start: int, length: int | None
+) -> None:
+    """Starts and ends are whole milliseconds, most of them between two ticks; 3 · 0.009 < 0.027 in floats."""
+    end = "" if length is None else f"..{(start + length) / 1000}"
+    plant, _ = faulty(f"rate:off@{start / 1000}{end}", f"command:off@{start / 1000}{end}", period=period)
+    acted, events = [], []
+    for k in range(round(0.7 / period)):
+        acted.append(missing(plant.measure().rate))
+        assert (plant.passes("command", b"a") == []) == acted[-1]
+        events += [transition.tick for transition in plant.transitions()]
+        assert acted[-1] == (start / 1000 <= round(k * period, 9) < (start + (length or 1000)) / 1000)
+        plant.advance()
+    for status in plant.statuses(0):
+        assert status.begin_tick is not None
+        ticks = range(status.begin_tick, len(acted) if status.end_tick is None else status.end_tick)
+        assert acted == [k in ticks for k in range(len(acted))]
+        edges = [] if not ticks else [ticks.start] if length is None else [ticks.start, ticks.stop]
+        assert events == sorted(2 * edges)
+
+
+def test_nothing_fails_and_no_time_passes_before_the_start() -> None:
+    plant, stand = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1", started=False)
+    at_once, other = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1")
+    at_once.actuate((3.0, 3.0))
+    for k in range(5):
+        plant.actuate((3.0, 3.0))
+        plant.advance()
+        assert (plant.time, stand.voltages, plant.measure()) == (0.0, (3.0, 3.0), sample(k + 1))
+        assert plant.passes("command", b"a") == [b"a"]
+    plant.start()
+    plant.actuate((3.0, 3.0))
+    assert stand.voltages == other.voltages != (0.0, 0.0)  # nor does the wait use up random numbers
+    assert stand.voltages[1] == 0.0
+    assert missing(plant.measure().rate)
+    plant.advance()
+    plant.start()  # a second call does nothing
+    plant.advance()
+    assert plant.time == 0.2
+
+
+# ── injection ──
+
+
+def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
+    plant, stand = faulty()
+    seen = []
+    for k in range(1, 9):
+        if k == 4:
+            inject(plant, "motor1:delay=0.2", "motor2:stuck", "rate.x:delay=0.2", "rate.y:stuck", "rate.z:off@0.2..0.3")
+        plant.actuate((1.0 * k, -1.0 * k))
+        plant.advance()
+        seen.append(plant.measure())
+    assert stand.periods == [(1, -1), (2, -2), (3, -3), (3, -3), (3, -3), (4, -3), (5, -3), (6, -3)]
+    known = [m.rate for m in seen if not missing(m.rate)]
+    assert [rate[0] for rate in known] == [1, 2, 3, 3, 4, 5, 6]
+    assert [rate[1] for rate in known] == [10, 20, 30, 30, 30, 30, 30]
+    assert [k for k, m in enumerate(seen, 1) if missing(m.rate)] == [5]
+    assert [m.attitude for m in seen] == [sample(k).attitude for k in range(1, 9)]
+
+
+def test_motors_fail_and_recover_under_a_held_voltage_and_one_stuck_at_once_keeps_what_it_had() -> None:
+    plant, stand = faulty("motor1:off@0.3..0.6", "motor2:stuck", started=False)
+    plant.actuate((5.0, 4.0))
+    plant.start()
+    plant.actuate((5.0, 9.0))
+    for _ in range(8):
+        plant.advance()
+    assert stand.periods == [(5, 4)] * 3 + [(0, 4)] * 3 + [(5, 4)] * 2
+
+
+def test_of_faults_that_cannot_be_none_is_injected() -> None:
+    plant, _ = faulty("rate:off")
+    with pytest.raises(FaultError, match=r"^fault 'motor3:off@2': the plant has no motor3, but motor1, motor2$"):
+        inject(plant, "rate:off", "motor3:off@2", clear=True)
+    with pytest.raises(FaultError, match="op inject --clear"):
+        inject(plant, *["rate:off"] * MAX_FAULTS)
+    assert len(plant.statuses(0)) == 1
+    three, stand = faulty("motor3:off", actuators=3)
+    three.actuate((1.0, 2.0, 3.0))
+    assert stand.voltages == (1.0, 2.0, 0.0)
+
+
+def test_faults_that_are_over_make_room() -> None:
+    """A plant that receives faults for days keeps a bounded number of them."""
+    plant, _ = faulty(*["command:off@0..0.1"] * MAX_FAULTS)
+    plant.transitions()
+    plant.advance()
+    plant.transitions()
+    inject(plant, *["rate:off"] * (MAX_FAULTS - 1))
+    assert [status.source for status in plant.statuses(0)] == ["configured"] + ["injected"] * (MAX_FAULTS - 1)
+
+
+def test_once_cleared_the_plant_is_as_without_faults_and_what_was_to_come_never_begins() -> None:
+    plant, stand = faulty("rate:off", "attitude:off", "motors:off", "command:delay=0.1", "rate:off@9")
+    plant.transitions()
+    plant.actuate((5.0, 5.0))
+    plant.advance()
+    assert plant.passes("command", b"a") == []
+    ends = inject(plant, clear=True)
+    assert [tick for tick, _ in ends] == [1] * 4
+    assert ends[3][1] == "fault ends (configured): command:delay=0.1, 1 commands delayed"
+    assert stand.voltages == (5.0, 5.0)
+    plant.advance()
+    assert plant.measure() == sample(2)
+    assert plant.passes("command", b"b") == [b"b"]
+    assert [(status.begin_tick, status.end_tick) for status in plant.statuses(10)] == [(10, 11)] * 4
+
+
+def test_frames_are_of_one_direction_and_those_held_back_are_lost_with_their_session() -> None:
+    plant, _ = faulty("command:delay=0.1", "measurement:off@0.2")
+    assert plant.passes("command", b"a") == []
+    plant.forget_frames()
+    plant.advance()
+    assert plant.passes("command", b"b") == []
+    assert plant.passes("measurement", b"m") == [b"m"]
+    plant.advance()
+    assert plant.passes("command", None) == [b"b"]
+    assert plant.passes("measurement", b"m") == []
+    inject(plant, "command:stuck", clear=True)
+    assert plant.passes("command", b"c") == [b"b"]  # the frame that passed last
+
+
+@pytest.mark.parametrize("fault", ["motors:bias=3", "motors:stuck@0.1", "motors:garble=1", "motors:delay=1"])
+def test_it_is_closed_at_no_voltage_whatever_its_faults_even_one_that_comes_too_late(fault: str) -> None:
+    plant, stand = faulty(fault)
+    for _ in range(3):
+        plant.actuate((5.0, 5.0))
+        plant.advance()
+    assert stand.voltages != (0.0, 0.0) or "delay" in fault
+    plant.close()
+    plant.close()
+    assert stand.voltages == (0.0, 0.0)
+    for clear in (True, False):
+        inject(plant, "motor1:off", clear=clear)
+        plant.advance()
+        assert stand.voltages == (0.0, 0.0)
+
+
+# ── random numbers ──
+
+
+def test_the_same_seed_fails_the_same_way_and_another_otherwise() -> None:
+    sensors = ("attitude:noise=0.1", "attitude:garble=0.3", "rate:noise=0.1", "rate.x:garble=0.3", "rate:drop=0.3")
+
+    def all_of(seed: int) -> list[str]:
+        seen = sensed(*sensors, ticks=50, seed=seed)
+        motors = driven("motors:noise=1", "motor1:garble=0.3", "motors:drop=0.3", ticks=50, seed=seed)
+        kinds = ("drop", "garble", "duplicate", "reorder")
+        streams = [passed(f"command:{kind}=0.5", frames=numbered(50), seed=seed) for kind in kinds]
+        return [repr(part) for part in (seen, motors, *streams)]
+
+    assert all_of(3) == all_of(3)
+    assert all(one != other for one, other in zip(all_of(3), all_of(4), strict=True))
+
+
+def test_one_more_fault_leaves_the_random_numbers_of_the_others_and_has_its_own() -> None:
+    alone = [m.rate for m in sensed("rate:noise=0.1")]
+    assert [m.rate for m in sensed("rate:noise=0.1", "attitude:garble=0.5")] == alone
+    twice = [m.rate[0] - k for k, m in enumerate(sensed("rate:noise=0.1", "rate:noise=0.1"))]
+    assert twice != pytest.approx([2 * (rate[0] - k) for k, rate in enumerate(alone)])
+    plant, _ = faulty("command:drop=0.5", "measurement:drop=0.5")
+    passes = [(plant.passes("command", b"a"), plant.passes("measurement", b"a")) for _ in range(100)]
+    assert any(command != measurement for command, measurement in passes)
