@@ -17,26 +17,22 @@ settings.load_profile("untimed")
 _STATES: Final = TemporaryDirectory(prefix="aeroloop-tests-")
 _SIGNALS: Final = signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
-PROCESSES: Final = ("tests/hil/", "tests/can/test_buses.py", "testing/conformance/")
+REAL_TIME: Final = ("tests/hil/", "tests/can/test_buses.py", "testing/conformance/")
 """Where every test starts processes, and is one of real time unless it is marked `smoke`; elsewhere a test says so."""
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what starts processes and needs real time, which runs only with `-m realtime`.
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what starts processes and needs real time, which runs only with `-m realtime` (see pyproject.toml).
 
     Checks of types come first, as they take long. Real time comes last, when no other work keeps the cores busy.
     """
     smoke = {item.path for item in items if item.get_closest_marker("smoke") is not None}
     items.sort(key=lambda item: (item.path.name != "test_house.py", item.path in smoke))
     for item in items:
-        if any(part in item.path.as_posix() for part in PROCESSES):
+        if any(part in item.path.as_posix() for part in REAL_TIME):
             item.add_marker(pytest.mark.processes)
             if item.get_closest_marker("smoke") is None:
                 item.add_marker(pytest.mark.realtime)
-    if not config.option.markexpr:
-        later = [item for item in items if item.get_closest_marker("realtime") is not None]
-        items[:] = [item for item in items if item.get_closest_marker("realtime") is None]
-        config.hook.pytest_deselected(items=later)
 
 
 def pytest_runtest_setup() -> None:

@@ -30,12 +30,11 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.lab import experiment
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review import review
-from aeroloop.service.testing.hil import Hil
-from aeroloop.service.theorem import certificate
-from aeroloop.service.theorem.certificate import Certificate
+from aeroloop.service.testing.hil import Hil, HilError
+from aeroloop.service.theorem.certificate import Certificate, certify
 
 __all__ = [
-    "AeroloopError", "Certificate", "Controller", "ExpressionLaw", "Figures", "Gain", "Gains3", "Hil",
+    "AeroloopError", "Certificate", "Controller", "ExpressionLaw", "Figures", "Gain", "Gains3", "Hil", "HilError",
     "HysteresisQuantizer", "LawSettings", "LogarithmicQuantizer", "Measurement", "Now", "Plant", "PositiveGain",
     "PythonLaw", "RecordedRun", "Settings", "SignalSpec", "State", "Ticks", "UniformQuantizer", "WireSpec", "certify",
     "gravity_torque", "load_settings", "read_run", "run_experiment", "voltages_for",
@@ -83,21 +82,6 @@ def run_experiment(
     """
     return experiment.run_experiment(
         settings or load_settings(), duration_s, watch=watch, plant=plant, controller=controller
-    )
-
-
-def certify(
-    settings: Settings | None = None, *, disturbance: float | None = None, attitude_error_deg: float | None = None
-) -> Certificate:
-    """Evaluate the paper's Theorem 1 (Corollary 1 with a disturbance) for a configuration, as `aeroloop lab certify`.
-
-    Args:
-        settings: The configuration; the defaults if None.
-        disturbance: Largest ‖τ_d‖ beyond what the plant's settings say [N·m]; a machine needs it.
-        attitude_error_deg: Assumed bound of the attitude error [deg]; 20 if None, within which sessions begin.
-    """
-    return certificate.certify(
-        settings or load_settings(), disturbance=disturbance, attitude_error_deg=attitude_error_deg
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.recording.rolling import log_path, parts
 from aeroloop.service.review.report import FaultInterval
 from aeroloop.service.review.review import read
-from aeroloop.service.testing.process_group import HilError, ProcessGroup, standalone
+from aeroloop.service.testing.process_group import ProcessGroup, standalone
 
 REFRESH_S = 0.1
 CLAIM_WAIT_S = 60.0
@@ -45,7 +44,7 @@ def run_demo(
         settings: The configuration; the rendezvous is replaced by a free one.
         duration_s: Length on the law's clock [s].
         log: Path of the log, or a folder for it; None for the recorder's.
-        show: Called ten times a second with what it waits for, empty while the controller drives, and the processes.
+        show: Called over and over with what it waits for, empty while the controller drives, and the processes.
 
     Returns:
         The figures, and whether the run is complete (False after ^C).
@@ -61,12 +60,15 @@ def run_demo(
     with ProcessGroup(settings) as processes, _on_interrupt(interrupted):
         show("three processes", processes)
         processes.start_loop()
-        deadline, claimed = time.monotonic() + CLAIM_WAIT_S, False
+
+        def begun() -> bool:
+            show("the first command", processes)
+            session = any(status.session for status in processes.statuses.values())
+            return session or interrupted.is_set() or not processes.running("controller")
+
+        processes.eventually("a session", begun, CLAIM_WAIT_S)
         while processes.running("controller") and not interrupted.wait(REFRESH_S):
             processes.check()
-            claimed = claimed or any(status.session for status in processes.statuses.values())
-            if not claimed and time.monotonic() > deadline:
-                raise HilError(f"no session began within {CLAIM_WAIT_S:g} s ({processes.states}); try again")
             show("" if processes.telemetry else "the first command", processes)
         processes.check()
         show("the review of the log", processes)

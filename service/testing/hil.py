@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Self
@@ -28,6 +27,7 @@ from aeroloop.service.settings import read_points
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import PATIENCE_S, ProcessGroup, RoleName, free_rendezvous, private_bus
 from aeroloop.service.testing.process_group import HilError as HilError
+from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
 
 PLANTS: Final = ("emulator", "can", "can-node", "quanser")
 """Plant ends by name; any other name is of a plant, which the emulator runs."""
@@ -60,8 +60,8 @@ class Hil:
         self._processes: ProcessGroup | None = None
         self._running = False
         self._logs: list[HilLog] = []
-        self._may_query: defaultdict[str, float] = defaultdict(float)  # of each topic, from when on
         self._requested_ticks = 0
+        self._may_advance = 0.0  # from when on the plant answers another such query, on the monotonic clock [s]
 
     def __enter__(self) -> Self:
         return self
@@ -81,13 +81,13 @@ class Hil:
             drive: Whether to start a controller and wait for it.
 
         Raises:
-            ConfigError: The configuration is invalid.
-            HilError: The loop did not close.
+            HilError: The configuration is invalid, or the loop did not close.
         """
         self.finish()
         log = self._folder / f"hil-{len(self._logs)}.mcap"
         ours = {
             "network.rendezvous": free_rendezvous(),
+            "network.mode": "peer",
             "recorder.path": str(log),
             "recorder.max_file_mb": 1e6,  # a test reads one file
             "recorder.max_file_s": 1e6,
@@ -98,8 +98,11 @@ class Hil:
             "plant.via": self._via,
             **({"plant.kind": self._kind} if self._kind else {}),
         }
-        overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
-        loaded = load(Path(config) if config else self._config, overrides)
+        try:
+            overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
+            loaded = load(Path(config) if config else self._config, overrides)
+        except AeroloopError as error:
+            raise HilError(str(error)) from None
         if self._private_bus:
             loaded = loaded.model_copy(update={"can": private_bus(loaded.can)})
         self._settings = loaded
@@ -124,31 +127,26 @@ class Hil:
             time.sleep(seconds)
             self.processes.check()
             return
-        self._requested_ticks += self.settings.loop.ticks(seconds)
+        steps = self.settings.loop.ticks(seconds)
+        self._requested_ticks += steps
         if self._via == "emulator":
-            self._query("advance", Advance(seconds=seconds))
+            self._advance(seconds)
 
         def over() -> bool:
             plant = self.processes.statuses.get("plant")
             return plant is not None and (plant.ticks >= self._requested_ticks or plant.session is None)
 
-        patience_s = PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds)
-        self.eventually(f"{seconds:g} s in lockstep", over, patience_s)
+        self.eventually(f"{seconds:g} s in lockstep", over, PATIENCE_S + PATIENCE_PER_STEP_S * steps)
         self.processes.check()
 
-    def inject(self, fault: str | None) -> None:
-        """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
-
-        None clears all faults. Raises HilError if the fault is malformed, or the plant is not emulated.
-        """
-        self._query("inject", Inject(clear=True) if fault is None else Inject(faults=[fault]))
+    # ── an operator's verbs; each returns what was done, in one line, and raises HilError if it is refused ──
 
     def arm(self) -> str:
-        """Arm the plant and recall controllers, as `aeroloop op arm`. Returns what was done; HilError if refused."""
-        return self._operate("arm", Request())
+        """Arm the plant and recall controllers, as `aeroloop op arm`."""
+        return self._operate("arm", Request)
 
     def stop(self) -> str:
-        """Stop the plant, as `aeroloop op stop`. Returns what was done; HilError if refused."""
+        """Stop the plant, as `aeroloop op stop`."""
         self._check_running()
         answers, failures = stop(self.settings.network, self.settings.vehicle)
         if failures:
@@ -156,26 +154,35 @@ class Hil:
         return "; ".join(answers)
 
     def release(self) -> str:
-        """Make the controller release the vehicle, as `aeroloop op release`. Returns and raises as `arm`."""
-        return self._operate("stand_down", Request())
+        """Make the controller release the vehicle, as `aeroloop op release`."""
+        return self._operate("stand_down", Request)
 
-    def goto(self, roll: float, pitch: float, yaw: float, within_s: float) -> str:
-        """Turn to an attitude [deg] within a time [s], as `aeroloop op goto`. Returns and raises as `arm`."""
-        return self.track(Hold(attitude=(roll, pitch, yaw)), within_s)
+    def goto(self, roll: float, pitch: float, yaw: float, in_s: float | None = None) -> str:
+        """Turn to an attitude [deg], as `aeroloop op goto`; `in_s` as of `track`."""
+        return self.track(Hold(attitude=(roll, pitch, yaw)), in_s)
 
-    def track(self, reference: Reference | Mapping[str, Any] | Path, within_s: float = 2.0) -> str:
-        """Follow another reference, as `aeroloop op track`. Returns and raises as `arm`.
+    def track(self, reference: Reference | Mapping[str, Any] | Path, in_s: float | None = None) -> str:
+        """Follow another reference, as `aeroloop op track`.
 
         Args:
             reference: A reference, a table as of `[reference]` (`{"kind": "sinusoid", …}`), or a CSV file of points.
-            within_s: Time to reach it [s].
+            in_s: Time to reach it, as of `--in` [s]; None for the shortest within the limits.
         """
         followed = read_points(reference) if isinstance(reference, Path) else reference
-        return self._operate("track", self._made(Track, reference=followed, within_s=within_s))
+        return self._operate("track", Track, reference=followed, within_s=in_s)
 
     def set_gains(self, **gains: float | Sequence[float]) -> str:
-        """Change gains of the law by name, as `aeroloop op set-gains`. Returns and raises as `arm`."""
-        return self._operate("set_gains", self._made(Gains, **gains))
+        """Change gains of the law by name, as `aeroloop op set-gains`."""
+        return self._operate("set_gains", Gains, **gains)
+
+    def inject(self, fault: str | None) -> str:
+        """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
+
+        None clears all faults.
+        """
+        return self._operate("inject", Inject, faults=[fault] if fault else [], clear=fault is None)
+
+    # ── processes ──
 
     def kill(self, role: RoleName) -> None:
         """Kill a role with SIGKILL."""
@@ -192,14 +199,18 @@ class Hil:
     def restart(self, role: RoleName) -> None:
         """Start a role again that has ended, and wait until it is on the network.
 
-        A recorder begins another log, which `log` then returns.
+        A plant that has tripped stays at 0 V until `arm`, unless `controller.auto_arm` is set. A recorder begins
+        another log, which `log` then returns.
         """
         if role == "recorder":
             self._logs.append(HilLog(self._folder / f"hil-{len(self._logs)}.mcap"))
-            self.processes.replace_log(self._logs[-1].path)
-        self.processes.start(role)
+            self.processes.start(role, "--log", str(self._logs[-1].path))
+        else:
+            self.processes.start(role)
         if role != "controller":
             self.processes.await_role(role)
+
+    # ── what there is to see ──
 
     @property
     def events(self) -> list[Event]:
@@ -208,8 +219,7 @@ class Hil:
 
     def state(self, role: str) -> str | None:
         """State of `plant`, `controller` or `recorder` in its last status; None before the first."""
-        status = self.processes.statuses.get(role)
-        return status.state if status else None
+        return self.processes.state(role)
 
     def status(self, role: str) -> Status:
         """The last status of a role. Raises HilError before the first."""
@@ -224,22 +234,6 @@ class Hil:
     def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
         """Wait until a condition on the loop holds. Raises HilError if it does not hold in time."""
         self.processes.eventually(what, condition, timeout_s)
-
-    def finish(self) -> None:
-        """Stop all processes and close the log."""
-        if self._running:
-            self._running = False
-            self.processes.__exit__(None, None, None)
-
-    def evidence(self) -> list[str]:
-        """Stop all processes and write what explains a failure beside each log: page and events.
-
-        Returns a line for each file: its path and what it is. Configuration and output of daemons are there already.
-        """
-        self.finish()
-        lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]
-        outputs = sorted(output for log in self._logs for output in log.path.with_suffix("").glob("*.txt"))
-        return [*lines, *(f"{output}: output of the {output.stem}" for output in outputs if output.stat().st_size)]
 
     @property
     def settings(self) -> Settings:
@@ -263,6 +257,22 @@ class Hil:
             raise HilError("nothing was started, so there is no log: call `hil.start()` first")
         return self._logs[-1]
 
+    def finish(self) -> None:
+        """Stop all processes and close the log."""
+        if self._running:
+            self._running = False
+            self.processes.__exit__(None, None, None)
+
+    def evidence(self) -> list[str]:
+        """Stop all processes and write what explains a failure beside each log: page and events.
+
+        Returns a line for each file: its path and what it is. Configuration and output of daemons are there already.
+        """
+        self.finish()
+        lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]
+        outputs = sorted(output for log in self._logs for output in log.path.with_suffix("").glob("*.txt"))
+        return [*lines, *(f"{output}: output of the {output.stem}" for output in outputs if output.stat().st_size)]
+
     def _closed(self) -> bool:
         """Whether the controller drives the plant; in lockstep, whether both ends have begun a session."""
         plant, controller = map(self.processes.statuses.get, ("plant", "controller"))
@@ -274,29 +284,24 @@ class Hil:
         if self.processes and not self._running:
             raise HilError("the run has ended, as reading `hil.log` ends it: call `hil.start()` for another")
 
-    def _made(self, model: type[Message], **values: Any) -> Message:
-        try:
-            return model.model_validate(values)
-        except ValidationError as error:
-            raise HilError(problem(error, model)) from None
-
-    def _operate(self, topic: str, message: Message) -> str:
+    def _operate(self, topic: str, model: type[Message], **values: Any) -> str:
         self._check_running()
         try:
-            return send(self.settings.network, self.settings.vehicle, topic, message)
+            return send(self.settings.network, self.settings.vehicle, topic, model.model_validate(values))
+        except ValidationError as error:
+            raise HilError(problem(error, model)) from None
         except AeroloopError as error:
             raise HilError(str(error)) from None
 
-    def _query(self, topic: str, message: Message) -> None:
-        """Query the emulator, whose queries for tests are no operator's."""
-        self._check_running()
-        key = topics.key(topic, self.settings.vehicle)
-        time.sleep(max(0.0, self._may_query[topic] - time.monotonic()))
+    def _advance(self, seconds: float) -> None:
+        """Let the emulator step, by a query that is a test's and no operator's."""
+        time.sleep(max(0.0, self._may_advance - time.monotonic()))
+        message, key = Advance(seconds=seconds), topics.key("advance", self.settings.vehicle)
         for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:
                 answer = Answer.model_validate_json(reply.ok.payload.to_bytes())
-                self._may_query[topic] = time.monotonic() + 1 / topics.QUERIES_PER_S  # sooner, it is dropped
+                self._may_advance = time.monotonic() + 1 / topics.QUERIES_PER_S  # sooner, it is dropped
                 if not answer.done:
                     raise HilError(answer.text)
                 return
-        raise HilError(f"no answer to {topic!r}")
+        raise HilError("the plant does not answer the request to step")

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from mcap.reader import make_reader
+from mcap.records import Channel
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
-from aeroloop.service.figures import Figures
-from aeroloop.service.review.review import report, review
+from aeroloop.service.logs.mcap_file import messages
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.review import read, report
 from aeroloop.service.testing.process_group import HilError
+from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
+
+M = TypeVar("M", bound=Message)
 
 
 @dataclass(frozen=True)
 class RunFigures:
-    """Figures of merit of a run that has ended; reading one that its log lacks raises HilError."""
+    """What `aeroloop log review --json` says of a session; reading a figure that its log lacks raises HilError."""
 
-    found: Figures
+    found: Findings
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.found, name)
@@ -39,22 +45,34 @@ class HilLog:
 
     @property
     def figures(self) -> RunFigures:
-        """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
-        return RunFigures(review(self._existing()))
+        """Figures of the longest session, from the log alone; its `sessions` says how many there are."""
+        return self.figures_of(None)
+
+    def figures_of(self, session: int | None) -> RunFigures:
+        """Figures of a session, by its number from 1 in the order of recording. Raises HilError if there is none."""
+        try:
+            return RunFigures(read(self._existing(), session=None if session is None else str(session)).findings)
+        except AeroloopError as error:
+            raise HilError(str(error)) from None
 
     @property
     def events(self) -> list[Event]:
         """Events in order."""
-        return [message for _, message in self.messages("event") if isinstance(message, Event)]
+        return [event for _, event in self.messages(Event)]
 
     @property
     def trips(self) -> list[str]:
         """Cause of each trip of the plant, in order."""
         return [event.text for event in self.events if event.kind == "tripped"]
 
+    def messages(self, model: type[M]) -> list[tuple[int, M]]:
+        """Messages of one kind, such as `Truth`, with their times of publication [ns], in that order."""
+        topic = next(topic for topic in topics.TOPICS.values() if topic.model is model)
+        return [(at_ns, model.model_validate_json(content)) for at_ns, content in self._published(topic)]
+
     def batches(self, end: End) -> list[Batch]:
-        """Trace batches of one end, in the order of recording."""
-        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
+        """Trace batches of one end, in the order of publication."""
+        read = [read_batch(content) for _, content in self._published(topics.TOPICS["trace"])]
         return [batch for batch in read if batch is not None and batch.header.end == end]
 
     def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
@@ -72,19 +90,12 @@ class HilLog:
         """Changes of references and gains that controllers applied, in order."""
         return [change for batch in self.batches("controller") for change in batch.tail.changes]
 
-    def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
-        """Time of publication [ns] and content of every message of one topic, by that time, of equal ones as recorded.
+    def _published(self, topic: topics.Topic) -> list[tuple[int, bytes]]:
+        def wanted(channel: Channel) -> bool | None:
+            address = topics.read_key(channel.topic)
+            return True if address is not None and address.topic is topic else None
 
-        Frames and traces are bytes.
-        """
-        found: list[tuple[int, Message | bytes]] = []
-        topic = topics.TOPICS[name]
-        with self._existing().open("rb") as file:
-            for _, channel, message in make_reader(file).iter_messages():
-                address = topics.read_key(channel.topic)
-                if address is not None and address.topic is topic:
-                    content = topic.model.model_validate_json(message.data) if topic.model else message.data
-                    found.append((message.publish_time, content))
+        found = [(message.publish_time, message.data) for _, message in messages(self._existing(), wanted)]
         return sorted(found, key=lambda each: each[0])
 
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:
@@ -98,11 +109,11 @@ class HilLog:
             return
         yield f"{self.path}: the log"
         events, shown = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
-        try:
-            timed = [(at, event) for at, event in self.messages("event") if isinstance(event, Event)]
-            lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
-        except Exception:  # whatever a broken log makes its reader raise
-            lines = [_line(event) for event in received]
+        timed: list[tuple[int, Event]] = []
+        with suppress(Exception):  # whatever a broken log makes its reader raise
+            timed = self.messages(Event)
+        lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
+        lines = lines or [_line(event) for event in received]
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:

@@ -1,4 +1,4 @@
-"""Process group: starts, watches and stops roles as child processes, for the demo and the tests.
+"""Process group: starts, watches and stops roles as child processes, for the demo, `hil`, the tests and the benchmarks.
 
 Each child runs the command that a user would type, with the effective configuration in a temporary file. It is a fork
 of multiprocessing's server, which has imported everything, because imports take over half a second of a core. A child
@@ -14,14 +14,16 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from multiprocessing.process import BaseProcess
+from operator import methodcaller
 from pathlib import Path
 from random import randrange
 from runpy import run_module
 from threading import Condition, Thread
 from typing import Any, Final, Literal, Self, get_args
+from unittest.mock import patch
 
 import zenoh
 
@@ -29,13 +31,13 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status, Telemetry
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import POLL_S, join
+from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.probe import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 
-RoleName = Literal["controller", "plant", "can-node", "recorder", "router"]
+RoleName = Literal["controller", "plant", "can-node", "recorder"]
+"""In the order of stopping."""
 
 PRELOADED: Final = (
     "aeroloop.service.cli.main",
@@ -49,58 +51,45 @@ PRELOADED: Final = (
     "casadi",  # the modules above import it at its first use
 )
 """Modules that the fork server imports, once for all children."""
-_BLOCKS: Final = 10_000, 32_000
-"""Ports to choose blocks from: below those that the system gives out by itself."""
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
 PATIENCE_S: Final = 30.0
 """Timeout for a state of the loop: a process starts in about a second here, and CI machines are busy."""
 
+__tracebackhide__ = methodcaller("errisinstance", AeroloopError)  # pytest shows the test's line, not ours
+
 
 class HilError(AeroloopError):
     """A process did not start or ended early, or the loop did not reach a required state; one line."""
+
+    __module__ = "aeroloop"  # from where users import it, and what pytest prints
 
 
 def start_command(words: Sequence[str], output: Path, environment: Mapping[str, str] | None = None) -> BaseProcess:
     """Run `aeroloop` with these words in a process and a session of its own; its stderr goes to the end of a file.
 
-    With additions to the environment it is a new interpreter, because the dynamic linker reads them at its start;
-    without, it is a fork of the server. Variables of the configuration are not passed on.
+    It is a fork of the server; with additions to the environment, even none, it is a new interpreter, because the
+    dynamic linker reads them at its start. Variables of the configuration are not passed on.
     """
     multiprocessing.set_forkserver_preload([*PRELOADED])
-    context: Any = multiprocessing.get_context("spawn" if environment else "forkserver")
+    context: Any = multiprocessing.get_context("forkserver" if environment is None else "spawn")
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
-    given = {**inherited, **(environment or {})}
     process: BaseProcess = context.Process(
-        target=_run_command, args=([*words], output, given, os.getcwd()), daemon=True
+        target=_run_command, args=([*words], output, inherited | dict(environment or {})), daemon=True
     )
     # NumPy would start threads at its import, before the command blocks the signals that its own thread waits for.
-    with _environment({"OPENBLAS_NUM_THREADS": "1", **(environment or {})}):
+    with patch.dict(os.environ, {"OPENBLAS_NUM_THREADS": "1", **(environment or {})}):
         process.start()
     return process
 
 
-@contextmanager
-def _environment(additions: Mapping[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in additions}
-    os.environ.update(additions)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
-
-
-def _run_command(words: list[str], output: Path, environment: Mapping[str, str], folder: str) -> None:
+def _run_command(words: list[str], output: Path, environment: Mapping[str, str]) -> None:
     os.setsid()
     with output.open("ab") as stderr, open(os.devnull, "wb") as null:
         os.dup2(null.fileno(), 1)
         os.dup2(stderr.fileno(), 2)
     os.environ.clear()
     os.environ.update(environment)
-    os.chdir(folder)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # in the thread, which handles none
     Thread(target=_follow_parent, daemon=True).start()
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -121,7 +110,7 @@ def free_rendezvous() -> str:
     """
     ports = NetworkSettings().ports
     while True:
-        first = randrange(*_BLOCKS, ports)  # noqa: S311  # no secret
+        first = randrange(10_000, 32_000, ports)  # noqa: S311  # no secret; below those that the system gives out
         reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with suppress(OSError):
             reservation.bind(("127.0.0.1", first))
@@ -145,15 +134,20 @@ def private_bus(can: CanSettings) -> CanSettings:
 def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
     """The settings of a loop that arms and moves by itself and records to a new log, on a free rendezvous and bus.
 
+    Args:
+        settings: Those of the user.
+        log: Path of the log.
+        controller: Keys of `[controller]` that this loop has otherwise.
+
     Raises:
         HilError: The log exists.
     """
     if parts(log):
         raise HilError(f"{log} exists, and a log is never written over; name another with --log PATH")
-    controller |= {"require_recorder": True, "auto_arm": True, "after_restart": "configured"}
+    controller = {"require_recorder": True, "auto_arm": True, "after_restart": "configured", **controller}
     return settings.model_copy(
         update={
-            "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()]}),
+            "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()], "mode": "peer"}),
             "controller": settings.controller.model_copy(update=controller),
             "can": private_bus(settings.can),
             "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
@@ -165,8 +159,7 @@ class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
     Their configuration and output, a text file each, are kept in the folder if one is given; `zenoh` is a session on
-    their network. Clients get a router of their own. The last status of each role, every event and the last telemetry
-    are collected as they are received.
+    their network. The last status of each role, every event and the last telemetry are collected as they are received.
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:
@@ -185,11 +178,6 @@ class ProcessGroup:
         self.statuses: dict[str, Status] = {}
         self.events: list[Event] = []
         self.telemetry: Telemetry | None = None
-        if settings.network.mode == "client":
-            self.start("router")
-            while not accepting(settings.network.rendezvous_endpoints):
-                self.check()
-                time.sleep(POLL_S)
         self.zenoh = join(settings.network)  # listens, so that a process links to it as it starts
         for topic in ("status", "event", "telemetry"):
             self.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), self._receive)
@@ -199,35 +187,31 @@ class ProcessGroup:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for role in get_args(RoleName):  # the controller first, recorder and router last
+        for role in get_args(RoleName):
             if role in self._children:
                 self.stop(role)
         self.zenoh.close()
         self._cleanup.close()
 
-    def start_loop(self, *, drive: bool = True) -> None:
+    def start_loop(self, *, drive: bool = True, environment: Mapping[str, str] | None = None) -> None:
         """Start recorder, plant end, a node on a bus that is software, and a controller; wait for recorder and plant.
 
         Args:
             drive: Whether to start a controller, which claims once both are there.
+            environment: As of `start_command`.
         """
-        self.start("recorder")
+        roles: list[RoleName] = ["recorder", "plant"]
         if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
-            self.start("can-node")
-        self.start("plant")
+            roles.insert(1, "can-node")
         if drive:
-            self.start("controller")
+            roles.append("controller")
+        for role in roles:
+            self.start(role, environment=environment)
         self.await_role("recorder")
         self.await_role("plant")
 
     def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> BaseProcess:
-        """Start a role; `await_role` waits until it is on the network.
-
-        Args:
-            role: The role to start.
-            arguments: Further words of its command line.
-            environment: As of `start_command`.
-        """
+        """Start a role, with further words of its command line; `await_role` waits until it is on the network."""
         words = [role, "--config", str(self._config), *arguments]
         self._children[role] = start_command(words, self._output(role), environment)
         self._killed.discard(role)
@@ -256,6 +240,10 @@ class ProcessGroup:
         """The state of each role, in one line."""
         return ", ".join(f"{role} {status.state}" for role, status in sorted(self.statuses.items()))
 
+    def state(self, role: str) -> str | None:
+        """The state in a role's last status; None before the first."""
+        return self.statuses[role].state if role in self.statuses else None
+
     def running(self, role: RoleName) -> bool:
         """Whether a started role still runs."""
         return self._children[role].is_alive()
@@ -281,12 +269,6 @@ class ProcessGroup:
     def pid(self, role: RoleName) -> int:
         """Process id of a started role."""
         return self._children[role].pid or 0
-
-    def replace_log(self, path: Path) -> None:
-        """Set the path of the log for recorders started from now on."""
-        recorder = self._settings.recorder.model_copy(update={"path": path})
-        self._settings = self._settings.model_copy(update={"recorder": recorder})
-        self._config.write_text(self._settings.toml())
 
     def check(self) -> None:
         """Raise HilError, with its last warning or error, if any process has failed."""

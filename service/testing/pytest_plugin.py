@@ -36,18 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker that the conformance suite uses, and refuse a plant that there is not."""
+    """Register the marker that the conformance suite uses."""
     config.addinivalue_line("markers", "processes: starts real processes, most of them in real time")
-    if plant := config.getoption("--hil-plant"):
-        from aeroloop.plant_emulator.plant import class_of
-        from aeroloop.protocol.errors import AeroloopError
-        from aeroloop.service.testing.hil import PLANTS
-
-        try:
-            if plant not in PLANTS:
-                class_of(plant)
-        except AeroloopError as error:
-            raise pytest.UsageError(f"--hil-plant is one of {', '.join(PLANTS)}, or a plant: {error}") from None
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -82,6 +72,6 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Add the evidence of a failed test's loop to its report, while the loop's folder is still there."""
     report = yield
-    if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) is not None:
-        report.sections.append(("hil", "\n".join(loop.evidence())))
+    if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) and (lines := loop.evidence()):
+        report.sections.append(("hil", "\n".join(lines)))
     return report

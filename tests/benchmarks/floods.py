@@ -15,28 +15,24 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import cycle
 from pathlib import Path
 from typing import Final
 
 import zenoh
-from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Loss, SessionRecord, Status
+from aeroloop.protocol.messages.models import Claim, Event, Loss, SessionRecord
 from aeroloop.protocol.messages.operator import Advance, Gains, Hold, Inject, Request, Setpoint, Sinusoid, Track
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.messages.topics import Topic
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings
-from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
-from tests.benchmarks.loop import NO_SCOUTING, memory_mb
-from tests.support.zenoh_network import eventually
+from aeroloop.service.testing.process_group import ProcessGroup, standalone
+from tests.benchmarks.loop import NO_SCOUTING, ROLES, memory_mb
 
-ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 SECONDS: Final = 4.0
 LINKED_S: Final = 0.5
 """A stranger is linked to all processes within this time."""
@@ -110,24 +106,16 @@ def flood(rendezvous: str, name: str, seconds: float) -> None:
 class Ends:
     """Skipped ticks and memory of the loop's processes, once the plant is driven."""
 
-    def __init__(self, processes: ProcessGroup, vehicle: str) -> None:
-        self._received: dict[str, Status] = {}
-        processes.zenoh.declare_subscriber(topics.key("status", vehicle), self._receive)
-        eventually("driving", lambda: "plant" in self._received and self._received["plant"].state == PlantState.DRIVEN)
+    def __init__(self, processes: ProcessGroup) -> None:
+        self._processes = processes
+        processes.eventually("driving", lambda: processes.state("plant") == PlantState.DRIVEN)
         self._before = self._now()
 
-    def _receive(self, sample: zenoh.Sample) -> None:
-        with suppress(ValidationError):
-            status = Status.model_validate_json(sample.payload.to_bytes())
-            self._received[status.role] = status
-
     def _now(self) -> dict[str, tuple[int, float]]:
-        self._received.clear()
-        eventually("a status of each", lambda: self._received.keys() >= {*ROLES})
-        return {
-            role: (status.skipped, memory_mb(int(status.process.rpartition(" ")[2])))
-            for role, status in self._received.items()
-        }
+        statuses = self._processes.statuses
+        statuses.clear()
+        self._processes.eventually("a status of each", lambda: statuses.keys() >= {*ROLES})
+        return {role: (statuses[role].skipped, memory_mb(self._processes.pid(role))) for role in ROLES}
 
     def since(self) -> str:
         """What has changed since the last call, end by end."""
@@ -141,9 +129,8 @@ def main(seconds: float, flooders: int, names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         settings = standalone(Settings(), Path(folder) / "log.mcap")
         with ProcessGroup(settings) as processes:
-            for role in ROLES:
-                processes.start(role, environment={"PYTHONUNBUFFERED": "1"})  # an interpreter of its own
-            ends = Ends(processes, settings.vehicle)
+            processes.start_loop(environment={})  # an interpreter each: forks would share memory
+            ends = Ends(processes)
             os.nice(19)  # it watches tokens, too
             time.sleep(seconds)
             ends.since()

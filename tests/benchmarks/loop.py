@@ -13,17 +13,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 import zenoh
 
-from aeroloop.service.testing.process_group import free_rendezvous
+from aeroloop.service.config import load
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, standalone
 
 PATIENCE_S: Final = 60.0
+ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 NO_SCOUTING: Final = {"scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}}}
 AEROLOOP: Final = [sys.executable, "-Pm", "aeroloop"]
 
@@ -46,27 +47,26 @@ class Turn(NamedTuple):
 
 def lockstep(seconds: float, overrides: Sequence[str]) -> float:
     """z_track of these seconds in lockstep."""
-    words = ["lab", "experiment", f"--duration={seconds}", "--json", *options(overrides)]
+    words = ["lab", "experiment", f"--duration={seconds}", "--json", *(f"--set={override}" for override in overrides)]
     z_track: float = json.loads(run(*words))["z_track"]
     return z_track
 
 
 def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: float) -> Turn:
     """One run in real time, beside z_track in lockstep."""
-    own = [f"network.rendezvous={free_rendezvous()}", "controller.after_restart=configured"]
-    words = options([*own, "controller.require_recorder=true", *overrides])
     with tempfile.TemporaryDirectory() as folder:
-        with _daemons(Path(folder), words, seconds) as daemons:
+        settings = standalone(load(overrides=overrides), Path(folder) / "log.mcap", duration_s=seconds)
+        with ProcessGroup(settings) as processes:
+            processes.start_loop(environment={})  # an interpreter each, as a user starts them: forks would share memory
             time.sleep(2 + seconds / 2)  # from a controller's start to its session some 2 s pass
-            memory = max(memory_mb(process.pid) for process in daemons)
-            try:
-                daemons[0].wait(seconds + PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                raise SystemExit(f"the controller does not end: {Path(folder, 'controller').read_text()}") from None
-            (status,) = json.loads(run("op", "status", "--json", *words)).values()
-        review, plant = json.loads(run("log", "review", f"{folder}/log.mcap", "--json")), status["plant"]
+            memory = max(memory_mb(processes.pid(role)) for role in ROLES)
+            processes.eventually("its end", lambda: not processes.running("controller"), seconds + PATIENCE_S)
+            plant = processes.statuses["plant"]
+        review = json.loads(run("log", "review", f"{folder}/log.mcap", "--json"))
     trip, period_us = review["latency_us"], 1e6 / rate_hz
     broken = [f"{review['sessions']} sessions instead of one"] if review["sessions"] != 1 else []
+    assert plant.timing is not None
+    assert plant.timing.wake is not None
     return Turn(
         ticks=round(seconds * rate_hz) - 1,  # the last one ends the session
         in_time=sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < period_us),
@@ -75,32 +75,11 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
         p99=trip["p99"],
         p999=trip["p999"],
         longest=trip["max"],
-        wake_p999=plant["timing"]["wake"]["p999"],
+        wake_p999=plant.timing.wake.p999,
         over_lockstep=review["z_track"] / z_track,
         memory_mb=memory,
-        notes=[*broken, *plant["notes"], *review["trips"], *review["damages"]],
+        notes=[*broken, *plant.notes, *review["trips"], *review["damages"]],
     )
-
-
-@contextmanager
-def _daemons(folder: Path, words: list[str], seconds: float) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Controller, plant and recorder, stopped at the end; each writes to a file that is named for it."""
-    verbs = [
-        ["controller", "--auto-arm", f"--set=controller.duration_s={seconds}"],
-        ["plant"],
-        ["recorder", f"--log={folder}/log.mcap"],
-    ]
-    processes, state = [], os.environ | {"XDG_STATE_HOME": str(folder)}  # a latch of this host is none of theirs
-    try:
-        for verb in verbs:
-            with Path(folder, verb[0]).open("wb") as output:
-                processes.append(subprocess.Popen([*AEROLOOP, *verb, *words], stderr=output, env=state))
-        yield processes
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait()
 
 
 def run(*words: str) -> str:
@@ -109,11 +88,6 @@ def run(*words: str) -> str:
     if done.returncode:
         raise SystemExit(f"aeroloop {' '.join(words)}: {done.stderr.strip()}")
     return done.stdout
-
-
-def options(overrides: Sequence[str]) -> list[str]:
-    """Overrides as words of a command line."""
-    return [f"--set={override}" for override in overrides]
 
 
 def memory_mb(pid: int) -> float:

@@ -56,7 +56,7 @@ def make(name: str) -> None:
                 hil.run(4)
                 hil.set_gains(C2=(0.2, 0.2, 0.2))
                 hil.run(1)
-                hil.goto(0, 10, -30, within_s=4)
+                hil.goto(0, 10, -30, in_s=4)
                 hil.inject("rate.y:bias=0.05@0..0.5")
                 hil.run(4)
                 hil.stop()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hil.test_clocks import python_clocks
+from tests.hil.test_clocks import STEP_S, python_clocks
 from tests.support.deployment import Deployment, Kind, Outcome
 from tests.support.namespaces import NoNamespacesError
 
@@ -39,6 +39,14 @@ def cables_and_a_new_router(hosts: Deployment) -> None:
     hosts.restart("router")
 
 
+def third_parties(hosts: Deployment) -> None:
+    """Over TCP alone, the harder case: frames share links and a lease of 1 s with all else."""
+    hosts.cut_off("recorder")
+    hosts.cut_off("operator")
+    hosts.choke("recorder", 64, 4.0)  # until what is queued for it fills the queues
+    hosts.halt("recorder")
+
+
 def assert_cheap(outcome: Outcome) -> None:
     """Lost datagrams and third parties cost no trip; what cuts the frames off does: 0 V in time, and driven again."""
     if any(party in outcome.title for party in ("recorder", "operator", "% lost")):
@@ -51,16 +59,20 @@ def assert_cheap(outcome: Outcome) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "happens", "clocks_differ"),
-    [("peers", cables_loss_and_a_narrow_link, False), ("router", cables_and_a_new_router, True)],
+    ("kind", "happens", "overrides", "ahead_s"),
+    [
+        ("peers", cables_loss_and_a_narrow_link, (), 0),
+        ("peers", third_parties, ("network.transport=tcp",), 0),
+        ("router", cables_and_a_new_router, (), STEP_S),
+    ],
 )
 def test_the_plant_rests_in_time_is_driven_again_and_the_log_lacks_nothing(
-    tmp_path: Path, kind: Kind, happens: Callable[[Deployment], None], clocks_differ: bool
+    tmp_path: Path, kind: Kind, happens: Callable[[Deployment], None], overrides: tuple[str, ...], ahead_s: float
 ) -> None:
     """With the router, the clocks of the controller's and the recorder's hosts are an hour ahead from the start."""
-    ahead = python_clocks(tmp_path, CLOCK_STEP=str(tmp_path)) if clocks_differ else {}
+    ahead = python_clocks(tmp_path, CLOCK_WRONG=str(ahead_s)) if ahead_s else {}
     try:
-        with Deployment(kind, tmp_path, PATIENT) as hosts:
+        with Deployment(kind, tmp_path, (*PATIENT, *overrides)) as hosts:
             hosts.start({"controller": ahead, "recorder": ahead})
             happens(hosts)
             for outcome in hosts.finish():

@@ -1,56 +1,115 @@
-"""A loop whose links are all mutual TLS: it runs and is operated, and nobody without a certificate links to it."""
+"""A loop whose links are all mutual TLS: it runs and is operated, and what is not a certificate's right is denied."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
+import os
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Final
 
 import pytest
+import zenoh
 
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Release
+from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Request
+from aeroloop.protocol.transport.network_settings import SecuritySettings
+from aeroloop.service.host.operator import OperatorError, gather, stop
 from aeroloop.service.testing.hil import Hil
-from tests.hil.test_faults import PATIENT
 from tests.support.certificates import Authority
+from tests.support.certified_link import open_session
+from tests.support.processes import PATIENT
 from tests.support.zenoh_network import eventually
 
 
 @pytest.mark.smoke
 def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tmp_path: Path) -> None:
+    """Slack: `PATIENT`'s; statuses are waited for, as on a busy machine a link may take longer than a command waits."""
     ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
-    ours.issue("plant", "aero")
-    ours.issue("controller", "aero")
-    for role in ("recorder", "operator"):
-        ours.issue(role)
-        foreign.issue(role)
+    for role, vehicle in (("plant", "aero"), ("controller", "aero"), ("recorder", None), ("operator", None)):
+        ours.issue(role, vehicle)
+    foreign.issue("operator")
     keys = {"network.security.directory": str(ours.folder), "network.loopback_secured": True}
     hil.start(settings={**PATIENT, **keys})
-    hil.run(3.0)  # beyond the first look at the places, which must not disturb the loop
-
-    def op(*words: str) -> subprocess.CompletedProcess[str]:
-        rendezvous = f"network.rendezvous={json.dumps(hil.settings.network.rendezvous)}"
-        command = [sys.executable, "-P", "-m", "aeroloop", "op", *words, "--set", rendezvous]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-
-    def keyed(folder: Path) -> list[str]:
-        return ["--set", f"network.security.directory={folder}", "--set", "network.loopback_secured=true"]
-
-    states = {"controller": "running", "plant": "driven", "recorder": "recording"}
+    network = hil.settings.network
 
     def well() -> bool:
-        found = json.loads(op("status", "--json", *keyed(ours.folder)).stdout or "{}").get("aero", {})
-        assert all(status["certificate_until"] for status in found.values())
-        return {role: status["state"] for role, status in found.items()} == states
+        with suppress(OperatorError):
+            statuses = gather(network).statuses["aero"]
+            assert all(status.certificate_until for status in statuses.values())
+            states = {role: status.state for role, status in statuses.items()}
+            return states == {"controller": "running", "plant": "driven", "recorder": "recording"}
+        return False
 
-    eventually("the status of all", well)  # on a busy machine a link may take longer than a command waits, 0.5 s
-    strangers = {"foreign": keyed(foreign.folder), "none": []}
-    for words in strangers.values():
-        refused = op("stop", *words)
-        assert refused.returncode == 1
-        assert len(refused.stderr.splitlines()) == 1
-        assert "Traceback" not in refused.stderr
-    assert "not of this authority" in op("status", *strangers["foreign"]).stderr
-    assert not hil.happened("tripped", "")
-    done = op("stop", *keyed(ours.folder))
-    assert done.returncode == 0, done.stderr
+    hil.eventually("the status of all", well)
+    for security in (network.security.model_copy(update={"directory": str(foreign.folder)}), SecuritySettings()):
+        stranger = network.model_copy(update={"security": security, "loopback_secured": security.folder is not None})
+        assert stop(stranger).answers == []
+        with pytest.raises(OperatorError, match="not of this authority" if security.folder else "no role answers"):
+            gather(stranger)
+    assert not hil.happened("tripped")
+    hil.stop()
     hil.eventually("the stop", lambda: hil.happened("tripped", "stopped by an operator"))
+
+
+STRANGERS: Final = {
+    ("observer", "aero"): frozenset(topics.TOPICS),
+    ("recorder", "aero"): frozenset(topics.TOPICS),
+    ("operator", "aero"): frozenset({"claim", "release", "record", "command", "measurement", "alive"}),
+    ("controller", "aero"): frozenset({"arm", "stop", "stand_down", "set_gains", "inject", "measurement", "reference"}),
+    ("plant", "bero"): frozenset(topics.TOPICS),
+    ("controller", "bero"): frozenset(topics.TOPICS),
+    ("operator", "bero"): frozenset(topics.TOPICS),
+}
+"""Certificates, and topics that are not theirs."""
+
+
+def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:
+    """Do with these topics what would end, steal or disturb a running session."""
+    requests: dict[str, Message] = {
+        **dict.fromkeys(("stop", "stand_down", "arm"), Request()),
+        "release": Release(session=running),
+        "set_gains": Gains(C1=(9.0, 9.0, 9.0)),
+        "inject": Inject(faults=["motors:bias=24"]),
+        "advance": Advance(seconds=1.0),
+    }
+    for name in sorted(names):
+        key = topics.key(name, "aero", session=running, role="plant")
+        for payload in (requests[name].encode() if name in requests else b"{}", os.urandom(7)):
+            session.put(key, payload)
+            session.delete(key)
+            session.get(key, lambda _: None, payload=payload, timeout=1.0)
+    for token in tokens if "alive" in names else []:
+        session.liveliness().declare_token(token).undeclare()
+
+
+@pytest.mark.smoke
+def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: Hil, tmp_path: Path) -> None:
+    """Slack: the watchdog of `PATIENT`; a second of driving, where a stop takes effect within milliseconds."""
+    ours = Authority(tmp_path)
+    for role in ("plant", "controller", "recorder", "operator"):
+        ours.issue(role, "aero")
+    hil.start(settings={**PATIENT, "network.security.directory": str(ours.folder), "network.loopback_secured": True})
+    hil.eventually("a status of each", lambda: hil.state("controller") == "running")
+    running = hil.status("controller").session
+    assert running is not None
+    alive = hil.processes.zenoh.liveliness().get(topics.key("alive", "aero"))
+    tokens = [str(reply.ok.key_expr) for reply in alive if reply.ok]
+    assert "aeroloop/aero/alive/plant" in tokens
+    places = [place.replace("tcp/", "tls/") for place in hil.settings.network.rendezvous_endpoints]
+    with ExitStack() as stack:
+        joined = {
+            who: stack.enter_context(open_session(ours.issue(*who, file="-".join(who)), connect=places))
+            for who in STRANGERS
+        }
+        for each in joined.values():
+            eventually("links", lambda e=each: len(list(e.info.peers_zid())) >= 4)  # type: ignore[misc]  # bound now
+        before = len(hil.events)
+        for who, names in STRANGERS.items():
+            harass(joined[who], names, running, tokens)
+        hil.run(1.0)
+        assert [event.text for event in hil.events[before:] if event.kind != "refused"] == []
+        assert (hil.state("plant"), hil.state("controller")) == ("driven", "running")
+        assert hil.status("controller").session == hil.status("plant").session == running
+        harass(joined["operator", "aero"], frozenset({"stop"}), running, tokens)  # as a proof that it would have
+        hil.eventually("the stop", lambda: hil.happened("tripped", "stopped by an operator"))

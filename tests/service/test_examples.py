@@ -27,23 +27,6 @@ def run(folder: Path, *words: str) -> str:
     return done.stdout
 
 
-def test_the_sweep_prints_a_line_for_each_number_of_bits_and_draws_them(tmp_path: Path) -> None:
-    printed = run(tmp_path, str(EXAMPLES / "sweep_bits.py"), "1", "sweep.svg").splitlines()
-    errors = [float(line.split("=")[1].split()[0]) for line in printed[:-1]]
-    assert [line[:2].strip() for line in printed[:-1]] == ["6", "7", "8", "9", "10", "12"]
-    assert errors[0] > errors[2] > errors[-1]
-    assert "<svg" in (tmp_path / "sweep.svg").read_text()
-
-
-def test_a_satellite_of_ones_own_in_mujoco_is_flown_with_each_number_of_bits(tmp_path: Path) -> None:
-    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
-    printed = run(tmp_path, str(EXAMPLES / "mujoco_plant.py"), "5").splitlines()
-    errors = [float(line.split("=")[1].split()[0]) for line in printed]
-    assert errors == sorted(errors, reverse=True)
-    assert len(errors) == 3
-    assert max(errors) < 20
-
-
 def test_a_log_is_read_back_into_numpy(tmp_path: Path) -> None:
     make_log(tmp_path / "run.mcap", 500)
     printed = run(tmp_path, str(EXAMPLES / "read_log.py"), "run.mcap")
@@ -60,28 +43,18 @@ def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
     assert "1 passed" in run(tmp_path, "-m", "pytest", "-q", "--hil-lockstep", name)
 
 
-PUBLIC = {
-    *("AeroloopError", "Certificate", "Controller", "Figures", "Hil", "HysteresisQuantizer", "LogarithmicQuantizer"),
-    *(
-        "Measurement",
-        "Plant",
-        "RecordedRun",
-        "Settings",
-        "SignalSpec",
-        "State",
-        "Ticks",
-        "UniformQuantizer",
-        "WireSpec",
-    ),
-    *("ExpressionLaw", "Gain", "Gains3", "LawSettings", "Now", "PositiveGain", "PythonLaw"),
-    *("certify", "gravity_torque", "load_settings", "read_run", "run_experiment", "voltages_for"),
-}
+PUBLIC = """
+    AeroloopError Certificate Controller Figures Hil HilError HysteresisQuantizer LogarithmicQuantizer Measurement Plant
+    RecordedRun Settings SignalSpec State Ticks UniformQuantizer WireSpec
+    ExpressionLaw Gain Gains3 LawSettings Now PositiveGain PythonLaw
+    certify gravity_torque load_settings read_run run_experiment voltages_for
+"""
 """Names that users write. One that is missing here is added on purpose, and none is ever taken away in passing."""
 
 
 def test_the_public_names_are_those_and_each_is_documented() -> None:
-    assert set(aeroloop.__all__) == set(dir(aeroloop)) == PUBLIC
-    for name in PUBLIC:
+    assert set(aeroloop.__all__) == set(dir(aeroloop)) == set(PUBLIC.split())
+    for name in aeroloop.__all__:
         assert getattr(aeroloop, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         aeroloop.nonsense  # noqa: B018  # the access is what is tested
@@ -103,12 +76,6 @@ def test_an_experiment_takes_a_plant_and_a_controller_of_ones_own() -> None:
     assert figures == aeroloop.run_experiment(settings, 0.5)
     assert seen == list(range(250))
     assert controller.tick_index == 249
-
-
-def test_what_is_wrong_is_one_line() -> None:
-    with pytest.raises(aeroloop.AeroloopError, match=r"wire\.voltage\.bits") as raised:
-        aeroloop.load_settings(overrides={"wire.voltage.bits": 99})
-    assert "\n" not in str(raised.value)
 
 
 def test_a_certificate_is_that_of_the_configuration() -> None:

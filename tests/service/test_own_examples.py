@@ -1,6 +1,6 @@
 """Examples of a law and of a plant of one's own: they work in a folder of the user's own, as their texts say.
 
-Real-time tests wait up to `PATIENCE_S` for an event; on an idle machine each comes within 3 s.
+Real-time tests wait up to half a minute for an event; on an idle machine each comes within 3 s.
 """
 
 from __future__ import annotations
@@ -8,8 +8,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,10 +15,9 @@ import pytest
 from aeroloop.protocol.messages.models import Truth
 from aeroloop.service import examples
 from aeroloop.service.testing.hil import Hil, HilError
+from tests.support.processes import aeroloop
 
 pytestmark = pytest.mark.processes
-
-PATIENCE_S = 120
 
 
 @pytest.fixture
@@ -32,16 +29,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(folder: Path, *words: str, code: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "aeroloop", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout if code == 0 else done.stderr
+    return aeroloop(*words, code=code, cwd=folder)
 
 
 @pytest.mark.parametrize("name", ["own_law.py", "own_plant.py"])
@@ -102,6 +90,6 @@ def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, kind:
         with pytest.raises(HilError, match=rf"is faulted: {re.escape(fault)}.*; `aeroloop op arm` lets it"):
             hil.set_gains(stiffness=[1.0, 1.0, 1.0])
     assert hil.processes.stop("controller") == (1 if kind == "Hanging" else 0)
-    truths = [truth for _, truth in hil.log.messages("truth") if isinstance(truth, Truth)]
+    truths = [truth for _, truth in hil.log.messages(Truth)]
     assert not any(truths[-1].voltages)
     assert any(any(truth.voltages) for truth in truths)

@@ -6,7 +6,6 @@ says when the plant was at 0 V.
 
 from __future__ import annotations
 
-import json
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,7 +53,6 @@ class Deployment(Hosts):
         self.kind = kind
         self.daemons: dict[str, Popen[bytes]] = {}
         self.log_file = folder / "log.mcap"
-        self._seen = folder / "seen"
         self._overrides = overrides
         self._keys = Authority(folder / "keys")
         for role in HOSTS:
@@ -78,7 +76,7 @@ class Deployment(Hosts):
         given = environments or {}
         for host in ("recorder", "plant", "controller", *(["router"] if self.kind == "router" else [])):
             self.start_daemon(host, given.get(host))
-        self.watch("operator", self._seen)
+        self._seen = self.watch("operator")
         self.await_driven(0.0)
 
     def start_daemon(self, host: str, environment: Mapping[str, str] | None = None) -> None:
@@ -116,20 +114,30 @@ class Deployment(Hosts):
         title = f"{kbit_per_s} kbit/s to and from the plant"
         self.suffer(title, partial(self.narrow, "plant", kbit_per_s, "both"), partial(self.plug, "plant"), for_s)
 
+    def choke(self, host: str, kbit_per_s: int, for_s: float) -> None:
+        """Limit what a host receives for a time."""
+        title = f"{kbit_per_s} kbit/s to the {host}"
+        self.suffer(title, partial(self.narrow, host, kbit_per_s), partial(self.plug, host), for_s)
+
+    def halt(self, host: str, for_s: float = AWAY_S) -> None:
+        """Halt a daemon for a time."""
+        halted, goes_on = (partial(self.daemons[host].send_signal, which) for which in (signal.SIGSTOP, signal.SIGCONT))
+        self.suffer(f"the {host} halted for {for_s:g} s", halted, goes_on, for_s)
+
     def restart(self, host: str) -> None:
+        self.suffer(
+            f"the {host} ended, and started again", partial(self._end, host), partial(self.start_daemon, host), 0.0
+        )
 
-        def end() -> None:
-            self.daemons[host].send_signal(signal.SIGTERM)
-            self.daemons[host].wait(STOP_WAIT_S)
-
-        self.suffer(f"the {host} ended, and started again", end, partial(self.start_daemon, host), 0.0)
+    def _end(self, host: str) -> None:
+        self.daemons[host].send_signal(signal.SIGTERM)
+        self.daemons[host].wait(STOP_WAIT_S)
 
     def await_driven(self, since: float) -> None:
         """Wait for a status of a driven plant that arrives after a time [s since 1970]."""
-        eventually("driving", lambda: any(
-            line.get("state") == "driven" and line["at"] > since
-            for line in map(json.loads, self._lines())
-        ))  # fmt: skip
+        eventually(
+            "driving", lambda: any(line.get("state") == "driven" and line["at"] > since for line in self._seen())
+        )
 
     def finish(self) -> list[Outcome]:
         """End the daemons, the recorder after the ends, and read what each trouble cost from the log.
@@ -139,24 +147,19 @@ class Deployment(Hosts):
         time.sleep(RECOVERY_S)
         self._finished = time.time()
         for host in ("controller", "plant", "recorder"):
-            self.daemons[host].send_signal(signal.SIGTERM)
-            self.daemons[host].wait(STOP_WAIT_S)
+            self._end(host)
         return list(self._outcomes())
 
     def missed(self) -> tuple[dict[str, int], int]:
         """By the log: ticks of each end that are missing, and other messages that the recorder missed for good."""
-        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages("loss") if isinstance(loss, Loss))
+        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages(Loss))
         return dict(read(self.log_file).findings.missing_ticks), losses
 
     def _outcomes(self) -> Iterator[Outcome]:
         log = HilLog(self.log_file)
-        events = [(at * 1e-9, event) for at, event in log.messages("event") if isinstance(event, Event)]
+        events = [(at * 1e-9, event) for at, event in log.messages(Event)]
         trips = [at for at, event in events if event.kind == "tripped"]
-        states = sorted(
-            (at * 1e-9, status.state)
-            for at, status in log.messages("status")
-            if isinstance(status, Status) and status.role == "plant"
-        )
+        states = sorted((at * 1e-9, status.state) for at, status in log.messages(Status) if status.role == "plant")
         ends = [*(begun for _, begun, _ in self._troubles[1:]), self._finished]
         for (title, begun, ended), until in zip(self._troubles, ends, strict=True):
             tripped = [at for at in trips if begun < at < until]
@@ -167,6 +170,3 @@ class Deployment(Hosts):
                 tripped[0] - begun if tripped else None,
                 max(0.0, driven[0] - ended) if driven else None,
             )
-
-    def _lines(self) -> list[str]:
-        return [line for line in self._seen.read_text().splitlines() if line.endswith("}")]

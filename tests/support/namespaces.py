@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -122,9 +122,14 @@ class Hosts:
         self._processes.append(process)
         return process
 
-    def watch(self, host: str, seen: Path) -> subprocess.Popen[bytes]:
-        """Write every status and event that a host receives into a file: a line of JSON each, `at` when it arrived."""
-        return self.python(host, "-m", "tests.support.namespaces", self.network.model_dump_json(), stdout=seen)
+    def watch(self, host: str) -> Callable[[], list[dict[str, Any]]]:
+        """Collect every status and event that a host receives from now on; they have `at`, the time of arrival [s].
+
+        A process group collects those of its own host only.
+        """
+        file = self._folder / f"{host}-seen"
+        self.python(host, "-m", "tests.support.namespaces", self.network.model_dump_json(), stdout=file)
+        return lambda: [json.loads(line) for line in file.read_text().splitlines() if line.endswith("}")]
 
     @property
     def network(self) -> NetworkSettings:

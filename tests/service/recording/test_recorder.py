@@ -30,7 +30,7 @@ from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
 from tests.support.cable import Cable
-from tests.support.made_messages import Ends, description_of
+from tests.support.made_log import description, made
 from tests.support.zenoh_network import Gathering, eventually, free_port
 
 KEY, TRACE = "aeroloop/aero/telemetry", "aeroloop/aero/trace/plant"
@@ -183,11 +183,9 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         publishers[key].put(payload)
         published.setdefault(key, []).append(payload)
 
-    publish(DESCRIPTION, description_of(settings, "plant").encode())
-    ends = Ends(settings)
-    for k in range(500):
-        for said in ends.tick(k, 10**10 + k * 2_000_000, START_NS + k * 2_000_000):
-            publish(said.key, said.payload)
+    publish(DESCRIPTION, description(settings, "plant").encode())
+    for message in made(settings, 500, truth_every=10):
+        publish(message.key, message.payload)
     for _ in range(2):
         running = record(max_file_s=0.001, decoded_hz=10.0)
         eventually("two files", lambda running=running: len(parts(running.path)) > 2)  # type: ignore[misc]
@@ -204,7 +202,7 @@ def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
     running = record()
     settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
     publish_without_cache(
-        gathering, DESCRIPTION, {number: description_of(each, "plant").encode() for number, each in settings.items()}
+        gathering, DESCRIPTION, {number: description(each, "plant").encode() for number, each in settings.items()}
     )
     running.await_written(4)
     running.end()

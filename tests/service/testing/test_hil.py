@@ -2,43 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from aeroloop.protocol.messages.models import Event
 from aeroloop.service.config import as_overrides, load
-from aeroloop.service.review.review import review
+from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil import Hil, HilError, HilLog
 from aeroloop.service.testing.hil_log import RunFigures
 from tests.support.made_log import make_log
 
-VERBS = {
-    "run": (1.0,),
-    "inject": ("rate:off",),
-    "arm": (),
-    "stop": (),
-    "release": (),
-    "goto": (0.0, 0.0, 10.0, 2.0),
-    "track": ({"kind": "sinusoid"},),
-    "set_gains": (),
-    "kill": ("plant",),
-    "pause": ("plant",),
-    "resume": ("plant",),
-    "restart": ("plant",),
+USES: dict[str, Callable[[Hil], object]] = {
+    "run": lambda hil: hil.run(1.0),
+    "inject": lambda hil: hil.inject("rate:off"),
+    "stop": lambda hil: hil.stop(),
+    "goto": lambda hil: hil.goto(0, 0, 10),
+    "set_gains": lambda hil: hil.set_gains(),
+    "kill": lambda hil: hil.kill("plant"),
+    "restart": lambda hil: hil.restart("plant"),
+    "settings": lambda hil: hil.settings,
+    "state": lambda hil: hil.state("plant"),
+    "log": lambda hil: hil.log,
 }
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_verb_before_start_says_what_to_call_first(verb: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("use", USES)
+def test_before_start_it_says_what_to_call_first(use: str, tmp_path: Path) -> None:
     with pytest.raises(HilError, match=r"call `hil\.start\(\)` first"):
-        getattr(Hil(tmp_path), verb)(*VERBS[verb])
-
-
-@pytest.mark.parametrize("attribute", ["settings", "processes", "log"])
-def test_an_attribute_before_start_says_what_to_call_first(attribute: str, tmp_path: Path) -> None:
-    with pytest.raises(HilError, match=r"call `hil\.start\(\)` first"):
-        getattr(Hil(tmp_path), attribute)
+        USES[use](Hil(tmp_path))
 
 
 def test_settings_may_be_nested_or_dotted_or_both() -> None:
@@ -51,7 +44,7 @@ def test_settings_may_be_nested_or_dotted_or_both() -> None:
 
 def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 20)
-    judged = review(tmp_path / "a.mcap")
+    judged = read(tmp_path / "a.mcap").findings
     figures = RunFigures(judged)
     assert figures.z_track == judged.z_track
     assert figures.command.frames_per_s == judged.command.frames_per_s
@@ -59,6 +52,8 @@ def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path)
     lacking = RunFigures(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
     with pytest.raises(HilError, match="the log gives no z_track: nothing answered"):
         _ = lacking.z_track
+    with pytest.raises(HilError, match="session"):
+        HilLog(tmp_path / "a.mcap").figures_of(7)
 
 
 def test_evidence_is_a_page_and_the_events_beside_the_log(tmp_path: Path) -> None:
@@ -75,17 +70,7 @@ def test_evidence_of_a_log_that_cannot_be_read_names_the_reason_and_has_the_even
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
     lines = list(HilLog(tmp_path / "a.mcap").evidence([event]))
     assert lines[-1].startswith("no page: ReviewError: ")
-    assert (tmp_path / "a-events.txt").read_text().split() == [
-        "plant",
-        "tripped",
-        "no",
-        "command",
-        "for",
-        "100",
-        "ms:",
-        "0",
-        "V",
-        "(tick",
-        "7)",
-    ]
+    assert (
+        " ".join((tmp_path / "a-events.txt").read_text().split()) == "plant tripped no command for 100 ms: 0 V (tick 7)"
+    )
     assert list(HilLog(tmp_path / "b.mcap").evidence([event])) == [f"{tmp_path / 'b.mcap'}: no log was written"]

@@ -6,24 +6,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from aeroloop.service.testing.process_group import free_rendezvous, start_command
+from tests.support.processes import LONGEST_S
+from tests.support.zenoh_network import eventually
 
 pytestmark = pytest.mark.processes
-PATIENCE_S = 20.0
-"""For what takes a tenth of a second here, or two where the server must be started first; CI may have other work."""
-
-
-def eventually(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("environment", [None, {"LANG": "C"}], ids=["fork", "new interpreter"])
@@ -34,7 +26,7 @@ def test_a_command_runs_as_typed_in_this_folder_without_this_process_s_settings(
     monkeypatch.setenv("AEROLOOP_LOOP__NONSENSE", "1")
     Path("wrong.toml").write_text("loop.rate_hz = 1e9")
     child = start_command(["plant", "--config", "wrong.toml"], tmp_path / "output", environment)
-    child.join(PATIENCE_S)
+    child.join(LONGEST_S)
     assert child.exitcode == 2
     (line,) = (tmp_path / "output").read_text().splitlines()
     assert line.startswith("aeroloop: loop.rate_hz")
@@ -47,11 +39,11 @@ def test_a_signal_ends_it_with_the_code_that_a_child_of_a_shell_would_have(
     log = tmp_path / "l.mcap"
     words = ["recorder", "--set", f"network.rendezvous={free_rendezvous()}", "--log", str(log)]
     child = start_command(words, tmp_path / "output")
-    eventually(lambda: log.exists() or not child.is_alive())
+    eventually("recording", lambda: log.exists() or not child.is_alive())
     assert child.is_alive()
     assert child.pid is not None
     os.kill(child.pid, sent)
-    child.join(PATIENCE_S)
+    child.join(LONGEST_S)
     assert child.exitcode == code
 
 
@@ -71,27 +63,16 @@ def test_nothing_outlives_the_process_that_started_it_even_if_that_is_killed(tmp
         assert process.stdout is not None
         child = int(process.stdout.readline())
         process.kill()
-        eventually(lambda: not running(child))
-    eventually(lambda: not any(session_of(line) == process.pid for line in stats()))
+        eventually("its end", lambda: child not in sessions())
+    eventually("the end of all", lambda: process.pid not in sessions().values())
 
 
-def running(pid: int) -> bool:
-    """Whether a process has not ended; one that nothing has waited for has."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def stats() -> list[str]:
-    found = []
+def sessions() -> dict[int, int]:
+    """The session of each process by its id, but for those that have ended and that nothing has waited for."""
+    found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            found.append(path.read_text())
-        except OSError:  # it has just ended
-            continue
-    return [line for line in found if line.rsplit(")", 1)[1].split()[0] != "Z"]
-
-
-def session_of(line: str) -> int:
-    return int(line.rsplit(")", 1)[1].split()[3])
+        with suppress(OSError):  # it has just ended
+            state, _, _, session, *_ = path.read_text().rsplit(")", 1)[1].split()
+            if state != "Z":
+                found[int(path.parent.name)] = int(session)
+    return found
