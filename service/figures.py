@@ -70,21 +70,12 @@ def figures(
     reasons: dict[str, str] | None = None,
     damages: Sequence[str] = (),
 ) -> Figures:
-    """Figures of a run.
+    """Figures of a run, whose ticks are `period` seconds apart.
 
-    Args:
-        wire: Sizes of the frames.
-        period: Time between ticks [s].
-        errors: Ticks, ascending, and the attitude error ε̃ at each, which holds until the next. Shapes (n,), (n, 3).
-        commands: Ticks, ascending, and the voltages commanded at each, held until the next or for `watchdog_s`; NaN
-            sets the plant to 0 V [V]. Shapes (m,), (m, actuators).
-        watchdog_s: Longest time for which a plant holds a command [s].
-        unsent: How many of these measurements and commands had no frame, as it would have repeated the last one.
-        latency: Loop latency.
-        log: Path of the log.
-        trips: Why the plant tripped.
-        reasons: Reasons of what is not available.
-        damages: What could not be read.
+    `errors` are ticks, ascending, and the attitude error ε̃ at each, which holds until the next, shapes (n,), (n, 3).
+    `commands` are ticks, ascending, and the voltages commanded at each, held until the next or for `watchdog_s`, shapes
+    (m,), (m, actuators); NaN sets the plant to 0 V [V]. Of these measurements and commands so many had no frame
+    (`unsent`), as it would have repeated the last one.
     """
     (k, error), (answered, voltages) = errors, commands
     reasons, names = dict(reasons or {}), ("z_track", "max_error_deg", "final_error_deg", "second_half_error_deg")

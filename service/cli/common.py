@@ -67,8 +67,8 @@ Require = Annotated[
     typer.Option(
         "--require",
         metavar="FIGURE=LIMIT",
-        help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped=0 or "
-        "latency.p99=2000; theorem=1: unless the run kept to all that is proven.",
+        help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped_ticks=0 or "
+        "latency_us.p99=2000; theorem.held=1: unless the run kept to all that is proven.",
     ),
 ]
 

@@ -97,9 +97,9 @@ def certify(
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
     settings = with_bits_of(loop_of(config, overrides), bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.theorem.certificate import certificate_of
+    from aeroloop.service.theorem import certificate
 
-    result = certificate_of(settings, disturbance=disturbance)
+    result = certificate.certify(settings, disturbance=disturbance)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

@@ -130,7 +130,7 @@ def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | N
                 bits=str(bits),
                 radius=at.radius,
                 degrees=degrees(2 * asin(at.eps_e)),
-                beyond=[name for *_, name in beyond(split, desired, p, at)],
+                beyond=[name for *_, name in beyond(split, p, at)],
             )
         found.append(point)
     return found

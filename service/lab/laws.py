@@ -24,7 +24,7 @@ from aeroloop.service.control.laws.baselines import TUNED, NonadaptiveSettings, 
 from aeroloop.service.control.laws.interface import EstimateSettings
 from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, figures_row, open_workers, run_of
 from aeroloop.service.lab.margins import LONGEST_S, WITHIN_DEG, survived
-from aeroloop.service.theorem.certificate import certificate_of
+from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import BoundlessError
 from aeroloop.service.theorem.feedback import NoTheoremError
 
@@ -161,9 +161,9 @@ def compare(
 
 
 def _proven(settings: Settings) -> float | None:
-    """The bound of the attitude error [deg]; None without a theorem or a bound, as of a user's own certificate."""
+    """The bound of the attitude error [deg]; None without a theorem or a bound."""
     try:
-        return getattr(certificate_of(settings, margins=False), "pointwise_deg", None)
+        return certify(settings, margins=False).pointwise_deg
     except (NoTheoremError, BoundlessError):
         return None
 

@@ -2,13 +2,12 @@
 "use strict";
 
 const { span, times, drawings } = JSON.parse(document.getElementById("data").textContent);
-const figures = [...document.querySelectorAll(".drawing")];
+const plots = [...document.querySelectorAll(".plot")];
 const pointed = matchMedia("(pointer: fine)").matches || !matchMedia("(any-pointer: coarse)").matches;
 const options = { displayModeBar: false, responsive: true, doubleClick: false, showTips: false };
-const [hiddenRuns, inSight, upToDate] = [new Set(), new Set(), new Set()];
 let shown = [...span]; // by every time axis [s]
 let jumpedTo = null; // time of an event [s]
-let frame = null;
+let round = 0; // of drawing everything
 
 /** Numbers of one of Plotly's typed arrays, [f4] or [f8]; empty where there are none. */
 function numbers({ dtype, bdata = "" }) {
@@ -19,18 +18,7 @@ function numbers({ dtype, bdata = "" }) {
 }
 
 const runTimes = times.map(numbers);
-
-/** A copy of a part of a figure, with the style sheet's colours, such as `var(--ink)`, as the present theme has them. */
-function themed(part) {
-  if (Array.isArray(part)) return part.map(themed);
-  if (typeof part === "object" && part) return Object.fromEntries(Object.entries(part).map(([key, each]) => [key, themed(each)]));
-  if (!/^var\(--[\w-]+\)$/.test(part)) return part;
-  const probe = document.body.appendChild(document.createElement("i"));
-  probe.style.color = part;
-  const found = getComputedStyle(probe).color;
-  probe.remove();
-  return found;
-}
+for (const { data } of Object.values(drawings)) for (const line of data) line.y = numbers(line.y);
 
 /** Index of the first time that is not before another. */
 function firstAt(instants, time) {
@@ -63,62 +51,38 @@ function inView(x, y, pixels) {
   return drawn;
 }
 
-/** Draw a figure, or draw it again: another time, another theme, another choice of runs. */
-async function draw(figure) {
-  const { data, layout } = drawings[figure.dataset.name];
-  const plot = figure.querySelector(".plot");
-  const isFirst = !plot.classList.contains("js-plotly-plot");
-  const overTime = figure.classList.contains("group");
-  const isSeen = ({ run }) => !hiddenRuns.has(run);
-  const traces = data.map(({ x, y, ...style }) => ({ ...themed(style), x, y, visible: isSeen(style) }));
-  const view = themed(layout);
-  view.font.family = getComputedStyle(document.body).fontFamily;
-  view.shapes = view.shapes.filter(isSeen);
-  if (overTime) {
-    const [from, to] = shown;
-    data.forEach((line, i) => {
-      if (isFirst) line.y = numbers(line.y);
-      const { isReduced, ...points } = inView(runTimes[line.times], line.y, Math.max(300, plot.clientWidth - 64));
-      Object.assign(traces[i], points);
-      if (isReduced) traces[i].line.shape = "linear";
-    });
-    view.xaxis.range = [from, to];
-    view.dragmode = pointed ? "zoom" : false;
-    view.annotations = view.annotations.filter(({ span, run }) => !span || (span[0] <= to && span[1] >= from && isSeen({ run })));
-    for (const label of view.annotations)
-      if (label.span) [label.x, label.xanchor] = [Math.max(label.span[0], from), label.span[0] > (from + to) / 2 ? "right" : "left"];
-    if (jumpedTo !== null)
-      view.shapes.push({ type: "path", path: `M${jumpedTo},0 L${jumpedTo},1`, yref: "paper", layer: "below", opacity: 0.35,
-        line: { color: themed("var(--accent)"), width: 9 } });
-  }
-  await Plotly.react(plot, traces, view, options);
-  if (!isFirst || !overTime) return;
+/** Draw a figure, or draw it again at another time; `size` is its width and height on paper [px]. */
+function draw(plot, size = {}) {
+  const { data, layout } = drawings[plot.dataset.name];
+  const isFirst = plot.data === undefined;
+  if (isFirst) plot.replaceChildren(); // of a page that a browser saved with its drawings
+  const traces = data.map((line) => {
+    const { isReduced, ...points } = inView(runTimes[line.times], line.y, Math.max(300, plot.clientWidth - 88));
+    return { ...line, ...points, line: { ...line.line, shape: isReduced ? "linear" : line.line.shape } };
+  });
+  const here = { type: "path", path: `M${jumpedTo},0 L${jumpedTo},1`, yref: "paper", layer: "below", opacity: 0.35,
+    line: { color: "#00629b", width: 9 } };
+  const view = { ...layout, ...size, dragmode: pointed ? "zoom" : false, xaxis: { ...layout.xaxis, range: [...shown] },
+    shapes: jumpedTo === null ? layout.shapes : [...layout.shapes, here] };
+  view.font = { ...layout.font, family: getComputedStyle(document.body).fontFamily };
+  Plotly.react(plot, traces, view, options);
+  if (!isFirst) return;
   plot.on("plotly_relayout", (change) => {
     if ("xaxis.range[0]" in change) showTime(change["xaxis.range[0]"], change["xaxis.range[1]"]);
   });
-  plot.on("plotly_doubleclick", () => moveTime("whole"));
+  plot.on("plotly_doubleclick", () => showTime(...span, null));
 }
 
-/** Draw what is in sight and not up to date, once before the next frame. */
-function refresh() {
-  frame ??= requestAnimationFrame(() => {
-    frame = null;
-    for (const figure of inSight) if (!upToDate.has(figure)) upToDate.add(figure), draw(figure);
-  });
+/** Draw every figure again, those in sight first; stops where the time is moved meanwhile. */
+async function redraw() {
+  const mine = ++round;
+  const distance = (plot) => Math.abs(plot.getBoundingClientRect().top);
+  for (const plot of [...plots].sort((a, b) => distance(a) - distance(b))) {
+    if (mine !== round) return;
+    draw(plot);
+    await new Promise((drawn) => setTimeout(drawn));
+  }
 }
-
-function redraw() {
-  upToDate.clear();
-  refresh();
-}
-
-const watcher = new IntersectionObserver((changes) => {
-  for (const { target, isIntersecting } of changes) inSight[isIntersecting ? "add" : "delete"](target);
-  refresh();
-}, { rootMargin: "400px" });
-for (const figure of figures) watcher.observe(figure);
-
-// the time that is shown: moved by buttons, keys, drawings and links to instants
 
 /** Show a span of time everywhere; what lies outside the run is left out. */
 function showTime(from, to, marked = jumpedTo) {
@@ -126,60 +90,27 @@ function showTime(from, to, marked = jumpedTo) {
   const width = Math.min(Math.max(to - from, Math.min((end - start) / 10, 0.002)), end - start);
   const middle = Math.min(Math.max((from + to) / 2, start + width / 2), end - width / 2);
   [shown, jumpedTo] = [[middle - width / 2, middle + width / 2], marked];
-  const digits = Math.min(3, Math.max(0, 2 - Math.floor(Math.log10(width))));
-  document.getElementById("shown").value = `${shown.map((time) => time.toFixed(digits)).join(" – ")} s`.replaceAll("-", "−");
   redraw();
 }
 
-const quarters = { earlier: [-1, -1], later: [1, 1], in: [1, -1], out: [-2, 2] }; // of what is shown
-const keys = { ArrowLeft: "earlier", ArrowRight: "later", "+": "in", "=": "in", "-": "out", 0: "whole", Home: "whole" };
-
-/** Move by the name of a button. */
-function moveTime(how) {
-  if (how === "whole") showTime(...span, null);
-  else showTime(...shown.map((time, i) => time + (quarters[how][i] * (shown[1] - shown[0])) / 4));
-}
-
-document.addEventListener("keydown", (event) => {
-  const isMove = keys[event.key] && event.target.matches(".group .plot");
-  if (!isMove || event.ctrlKey || event.metaKey || event.altKey) return;
-  event.preventDefault();
-  moveTime(keys[event.key]);
-});
+const moves = { earlier: [-1, -1], later: [1, 1], in: [1, -1], out: [-2, 2] }; // in quarters of what is shown
 
 document.addEventListener("click", ({ target }) => {
-  const { move, time, run } = target.closest("[data-move], [data-time], [data-run]")?.dataset ?? {};
-  if (move) moveTime(move);
+  const { move, time } = target.closest("[data-move], [data-time]")?.dataset ?? {};
+  if (move === "whole") showTime(...span, null);
+  else if (move) showTime(...shown.map((each, i) => each + (moves[move][i] * (shown[1] - shown[0])) / 4));
   if (time) {
     const half = Math.min((span[1] - span[0]) / 2, Math.max(0.5, (span[1] - span[0]) / 50));
     showTime(Number(time) - half, Number(time) + half, Number(time));
     document.getElementById("tracking").scrollIntoView();
   }
-  if (run) {
-    hiddenRuns[hiddenRuns.has(Number(run)) ? "delete" : "add"](Number(run));
-    for (const each of document.querySelectorAll(`[data-run="${run}"]`)) each.setAttribute("aria-pressed", !hiddenRuns.has(Number(run)));
-    redraw();
-  }
 });
 
-moveTime("whole");
-
-// light and dark: the system's, or the other until the button is pressed again; print is light, and has every drawing
-
-const prefersDark = matchMedia("(prefers-color-scheme: dark)");
-const root = document.documentElement.style;
-let screenTheme = "";
-
-/** Change the theme: "light", "dark", or the system's. */
-function setTheme(theme) {
-  [screenTheme, root.colorScheme] = [root.colorScheme, theme];
-  redraw();
-}
-
-prefersDark.addEventListener("change", redraw);
-document.getElementById("theme").addEventListener("click", () => setTheme(root.colorScheme ? "" : prefersDark.matches ? "light" : "dark"));
+for (const plot of plots) draw(plot); // all at once, so that a page saved or printed at once has its drawings
 addEventListener("beforeprint", () => {
-  setTheme("light");
-  figures.forEach(draw);
+  for (const plot of plots) draw(plot, { width: 465, height: 60 + 100 * plot.dataset.panels, autosize: false });
 });
-addEventListener("afterprint", () => setTheme(screenTheme));
+addEventListener("afterprint", () => {
+  plots.forEach(Plotly.purge); // which forgets the size on paper
+  redraw();
+});

@@ -7,18 +7,17 @@ The content security policy lists the hashes of the page's scripts: a browser ru
 from __future__ import annotations
 
 from base64 import b64encode
-from collections import Counter
 from collections.abc import Sequence
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from aeroloop.service.report import rows
-from aeroloop.service.report.drawings import drawings, page_data
+from aeroloop.service.report.drawings import COLOURS, drawings, page_data
 from aeroloop.service.review.report import Findings, Report, differences, flat
 from aeroloop.service.review.requirements import percent, seconds
 
@@ -36,12 +35,11 @@ def page(reports: Sequence[Report]) -> str:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count)}
-    environment.filters["micros"] = rows.micros
+    environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
     environment.tests["grave"] = rows.grave
     scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
-    runs, drawn = [report.findings for report in reports], list(drawings(reports))
+    runs, drawn = [report.findings for report in reports], drawings(reports)
     return environment.get_template("page.html").render(
         reports=reports,
         runs=list(enumerate(reports)),
@@ -51,6 +49,7 @@ def page(reports: Sequence[Report]) -> str:
         scripts=scripts,
         data=page_data(reports, drawn),
         drawings=drawn,
+        colours=COLOURS,
         rows=rows.figure_rows(runs),
         differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
@@ -59,45 +58,36 @@ def page(reports: Sequence[Report]) -> str:
         theorem=[rows.theorem_sentences(run) for run in runs],
         durations=rows.durations(runs),
         percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
-        judgement=judgement,
+        verdict=verdict,
         largest_error=largest_error,
         thinned=max(reports, key=lambda report: report.thinned),
     )
 
 
-# ── what the template shows ──
+def verdict(run: Findings) -> tuple[str, bool | None, str]:
+    """Verdict on a run in a word, whether it is good (None: nothing was required), and because of what.
 
-
-class Judgement(NamedTuple):
-    """Verdict on a run in a word, and whether it is good; None without limits and without a failure."""
-
-    word: str
-    good: bool | None
-    because: str
-
-
-def judgement(run: Findings) -> Judgement:
-    """Verdict by the limits of `--require`; without any, by trips and missing figures. It says if there were faults."""
-    limits = rows.count(len(run.checks), "limit")
+    By the limits of `--require`; without any, by trips, missing figures, faults and losses.
+    """
+    found: tuple[str, bool | None, str]
+    troubles, limits = sum(map(rows.grave, run.marks)), rows.count(len(run.checks), "limit")
     if broken := sum(not check.holds for check in run.checks):
-        found = Judgement("Not held", False, f"{broken} of {limits} broken.")
+        found = "Not held", False, f"{broken} of {limits} broken."
     elif run.checks:
-        found = Judgement("Held", True, f"{limits} required, none broken.")
+        found = "Held", True, f"{limits} required, none broken."
     elif run.z_track is None:
-        found = Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
+        found = "Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered")
     elif run.trips:
         times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
-        found = Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
+        found = "Tripped", False, f"The plant went to 0 V by itself {times}."
+    elif troubles or run.faults:
+        found = "Faults", None, "No trip; faults, losses and refusals are listed below."
     else:
-        found = Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was required.")
+        found = "No trip, no fault", None, "No limit was required."
     if not run.faults:
         return found
-    changed: Counter[str] = Counter()
-    for fault in run.faults:
-        changed[fault.effect] += fault.changed
-    counts = ", ".join(f"{n:,} {effect}" for effect, n in changed.items())
-    because = f"{found.because} {rows.count(len(run.faults), 'fault')} acted at the plant: {counts}."
-    return Judgement(f"{found.word}, with faults", found.good, because)
+    changed = ", ".join(f"{fault.changed:,} {fault.effect}" for fault in run.faults)
+    return *found[:2], f"{found[2]} {rows.count(len(run.faults), 'fault')} acted at the plant: {changed}."
 
 
 def largest_error(report: Report) -> tuple[float, float] | None:

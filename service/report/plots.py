@@ -1,7 +1,4 @@
-"""Figures of a session for a paper: roll, pitch and yaw, Figures C.4–C.14, and what the theorem bounds.
-
-All quantities are drawn in every case; `NUMBERS` of review/panels.py has the paper's number of each.
-"""
+"""Figures of a session for a paper: roll, pitch and yaw, Figures C.4–C.14, and ‖z‖, as PDF, SVG and PNG."""
 
 from __future__ import annotations
 
@@ -19,16 +16,8 @@ from aeroloop.service.report.figure_style import BLUE, GREEN, ORANGE, WIDTH_IN, 
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
 
-FIGURES: Final = {
-    "angles": ["angles"],
-    "attitude": ["attitude"],
-    "rate": ["rate"],
-    "error": ["attitude_error"],
-    "rate_error": ["rate_error"],
-    "input": ["input"],
-    "theorem": ["z_norm", "lyapunov"],
-}
-"""Figures by name, with the groups of panels in each."""
+FIGURES: Final = ("angles", "attitude", "rate", "error", "rate_error", "input", "theorem")
+"""Groups of panels that are drawn, a figure each."""
 
 LETTERS: Final = {
     "η": r"\eta", "ε": r"\epsilon_{}", "ε̃": r"\tilde{{\epsilon}}_{}", "ω": r"\omega_{}", "ω_e": r"\omega_{{e,{}}}",
@@ -53,8 +42,8 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
         raise ReviewError("the log has no answered measurement to draw")
     case, paths = case_of(settings), list[Path]()
     with figure_style():
-        for name, groups in FIGURES.items():
-            panels = [panel for group in groups for panel in report.panels if panel.group == group]
+        for name in FIGURES:
+            panels = [panel for panel in report.panels if panel.group == name]
             if not panels:
                 continue
             figure = Figure(figsize=(WIDTH_IN[1], 0.45 + 0.85 * len(panels)), layout="constrained")
@@ -71,12 +60,8 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
                     fault.fault, (fault.begin_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
                     textcoords="offset points", va="top", fontsize=6,
                 )  # fmt: skip
-            labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
-            if any(each != labels[0] for each in labels):
-                for axis in axes:
-                    axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
-            elif len(labels[0]) > 1:
-                figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
+            if len(panels[0].lines) > 1:
+                figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(panels[0].lines))
             number = NUMBERS[case].get(name)
             paths += save(figure, folder, f"{number}-{name}" if number else name)
     return paths
@@ -87,8 +72,7 @@ def _draw(axis: Axes, panel: Panel, report: Report) -> None:
         known = np.isfinite(line.values) if not line.held else slice(None)
         steps = "steps-post" if line.held and report.thinned <= 2 else "default"
         stroke = DESIRED if line.desired else MEASURED if line.held else TRUE
-        label = line.label.replace("θ̃", r"$\tilde{\theta}$")
-        axis.plot(report.time[known], line.values[known], label=label, drawstyle=steps, **stroke)
+        axis.plot(report.time[known], line.values[known], label=line.label, drawstyle=steps, **stroke)
     for fault in report.findings.faults:
         end_s = report.time[-1] if fault.end_s is None else fault.end_s
         axis.axvspan(fault.begin_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
@@ -97,7 +81,7 @@ def _draw(axis: Axes, panel: Panel, report: Report) -> None:
 def _label(panel: Panel, quantized: str) -> str:
     """An axis label: the panel's letter in mathematics, and the unit if it has one."""
     letter, axis = panel.label.rstrip("₁₂₃123"), panel.label[-1].translate(DIGITS)
-    text = {"‖z‖": r"$\|z\|$", "V": "$V$"}.get(panel.label, panel.label)
+    text = r"$\|z\|$" if panel.label == "‖z‖" else panel.label
     if letter in LETTERS:
         text = f"${LETTERS[letter].format(axis)}{quantized}$"
     return text if panel.unit == "1" else f"{text} [{panel.unit}]"

@@ -1,7 +1,4 @@
-"""Several runs side by side: what differs in their configurations, and their figures.
-
-`log compare --json` prints a `Comparison`; the terminal and the page show the same from the reports.
-"""
+"""Several runs side by side: what differs in their configurations, and their figures (`log compare --json`)."""
 
 from __future__ import annotations
 
@@ -20,16 +17,16 @@ from aeroloop.service.review.review import read
 
 
 class SettingDifference(BaseModel, frozen=True):
-    """A key of the configuration whose value is not the same in every run."""
+    """A dotted key of the configuration whose value is not the same in every run; null where a run has no such key."""
 
-    key: str = Field(description="dotted, such as `law.C2`")
-    values: dict[str, Any] = Field(description="by run; null where a run has no such key")
+    key: str
+    values: dict[str, Any] = Field(description="by run")
 
 
 class Comparison(BaseModel, frozen=True):
-    """Runs side by side."""
+    """Runs by their names, which differ."""
 
-    runs: dict[str, Findings] = Field(description="by the run's name")
+    runs: dict[str, Findings]
     differences: list[SettingDifference]
 
     @classmethod
@@ -43,7 +40,7 @@ class Comparison(BaseModel, frozen=True):
 def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
     """A report of every log or folder, each a run of its own, checked against limits. Raises as `read` does.
 
-    Their names differ: logs of one name are named with their folders, and if that is not enough, by number.
+    Logs of one name are named with their folders, and if that is not enough, by number.
     """
 
     def share(done: int) -> Progress | None:
@@ -51,12 +48,8 @@ def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Prog
 
     points = MAX_POINTS // len(logs)  # one page holds them all
     runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
-    alike = [run.name for run in runs]
-    names = [
-        name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"
-        for name, log in zip(alike, logs, strict=True)
-    ]
-    nth = [names[: i + 1].count(name) for i, name in enumerate(names)]
-    return [
-        replace(run, name=name if n == 1 else f"{name} ({n})") for run, name, n in zip(runs, names, nth, strict=True)
-    ]
+    alike, names = [run.name for run in runs], list[str]()
+    for name, log in zip(alike, logs, strict=True):
+        long = name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"
+        names.append(long if long not in names else f"{long} ({sum(one.startswith(long) for one in names) + 1})")
+    return [replace(run, name=name) for run, name in zip(runs, names, strict=True)]

@@ -2,15 +2,14 @@
 
 An event is shown at its sender's time, wherever it stands in the file: with a session tick at that tick, any other by
 its time of publication on the session's clock, as the sender's own trace relates the two. For a sender without a
-trace, such as a recorder, the plant's trace does, so two hosts' clocks are compared there: that is for showing only,
-nothing is decided by it. The first few hundred of each kind become marks and the rest are counted.
+trace, such as a recorder, the plant's trace does, for showing only.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from math import ceil, inf, isfinite
+from collections.abc import Mapping
+from math import inf, isfinite
 from operator import itemgetter
 from typing import Final, NamedTuple
 
@@ -40,21 +39,13 @@ class Truths(NamedTuple):
     signals: Mapping[str, Array] = {}
 
 
-class Published(NamedTuple):
-    """A message with the role that published it, and when, on its wall clock [ns]."""
-
-    at_ns: int
-    role: str
-    message: Event | Loss | Status
-
-
 class Messages(NamedTuple):
-    """Messages beside the traces: those of one vehicle by time of publication, and one session's true states.
+    """Messages beside the traces, one session's true states, and how many are malformed by topic, of any vehicle.
 
-    `malformed` counts malformed messages by topic, of any vehicle.
+    Each message of the vehicle has its time on the wall clock of the role that published it [ns]; in order of time.
     """
 
-    published: list[Published]
+    published: list[tuple[int, str, Event | Loss | Status]]
     truths: Truths
     malformed: Counter[str]
 
@@ -65,7 +56,8 @@ class Messages(NamedTuple):
 
 def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
     """Read the messages of a session and its vehicle; one that a restarted recorder recorded again counts once."""
-    malformed, published, known = Counter[str](), list[Published](), set[int]()
+    malformed, known = Counter[str](), set[int]()
+    published = list[tuple[int, str, Event | Loss | Status]]()
     states = TrueStates({which[1]: actuators})
 
     def wanted(address: Address) -> Address | None:
@@ -85,7 +77,7 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
                 if age is not None and not isfinite(age.p50 + age.p99 + age.max):
                     raise ValueError
                 if address.vehicle == which[0]:
-                    published.append(Published(at_ns, address.role or "recorder", message))
+                    published.append((at_ns, address.role or "recorder", message))
         except ValueError:  # a stranger may publish anything, such as 1e999
             malformed[name] += 1
     rows = states.rows(which[1])
@@ -155,8 +147,8 @@ def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
 def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]:
     """Faults of an emulated plant that acted in a session, in order of time.
 
-    Its status has every fault with its begin and end in ticks of the plant, and the trace the plant's tick of each of
-    the session's. So all intervals are known to the tick, whatever event was lost and whenever recording began.
+    Its status has their begin and end in ticks of the plant, and the trace the plant's tick of each of the session's:
+    intervals are known to the tick, whatever event was lost.
     """
     statuses = messages.statuses("plant")
     own = [i for i, status in enumerate(statuses) if status.session == session.which[1]]
@@ -194,18 +186,6 @@ def described(change: Change) -> str:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")
     return "; ".join(parts)
-
-
-def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
-    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
-    since, begun = 0, set[str]()
-    for change in changes:
-        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
-        if change.start is None and begun == {"gains", "reference"}:
-            return since, change.tick
-        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
-        since = max(since, change.tick + ceil(change.within_s / period))
-    return since, inf
 
 
 class _Clocks:

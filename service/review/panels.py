@@ -1,21 +1,18 @@
 """Panels of a session: every quantity over time, in the order of the paper's figures and with their numbers.
 
-A log is one run, and a run is one of the paper's three cases: without quantization (C.4–C.6), with it (C.7–C.11), with
-it and wind (C.12–C.14). Every quantity is drawn in every case; a title has the paper's number where the paper has
-that figure. Every tick is drawn while there are few enough; of more, the least and the largest value of each bucket, so
-that no extreme is lost.
+A run is one of the paper's three cases, and its titles have the paper's numbers where the paper has that figure. Every
+tick is drawn while there are few enough; of more, the least and the largest value of each bucket.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import inf
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.session import Array, Integers
@@ -24,7 +21,7 @@ from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
-from aeroloop.service.review.theorem import TheoremCheck, signals
+from aeroloop.service.review.theorem import TheoremCheck
 
 MAX_POINTS: Final = 180_000
 """Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
@@ -32,15 +29,8 @@ MAX_POINTS: Final = 180_000
 DESIRED: Final = ("desired", "bound")
 """Beginnings of the names of lines that a run should follow, or stay below."""
 
-Case = Literal["continuous", "quantized", "wind"]
-
-CASES: Final[dict[Case, str]] = {
-    "continuous": "without quantization",
-    "quantized": "with quantization",
-    "wind": "with wind",
-}
-
-NUMBERS: Final[dict[Case, dict[str, str]]] = {
+CASES: Final = {"continuous": "without quantization", "quantized": "with quantization", "wind": "with wind"}
+NUMBERS: Final[dict[str, dict[str, str]]] = {
     "continuous": {"error": "C.4", "rate_error": "C.5", "input": "C.6"},
     "quantized": {"attitude": "C.7", "rate": "C.8", "error": "C.9", "rate_error": "C.10", "input": "C.11"},
     "wind": {"error": "C.12", "rate_error": "C.13", "input": "C.14"},
@@ -54,7 +44,7 @@ _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
 """Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""
 
 
-def case_of(settings: Settings) -> Case:
+def case_of(settings: Settings) -> str:
     """The paper's case that a session belongs to."""
     if settings.plant.wind.blowing:
         return "wind"
@@ -78,7 +68,10 @@ def panels_of(
         quarter = np.maximum(0.0, ((last - first + 1) / 2 - 1) / 2)
         k = np.column_stack([first + quarter, last - quarter]).ravel()
     panels = list[Panel]()
+    case = case_of(settings)
     for group, title, labels, unit, lines in _quantities(settings, ticks, theorem, truths):
+        if number := NUMBERS[case].get(group):
+            title = f"Figure {number}: {title} {CASES[case]}"
         for i, label in enumerate(labels):
             columns = {name: values.reshape(n, -1)[:, i] for name, values in lines.items()}
             drawn = [
@@ -102,11 +95,7 @@ def outline(values: Array, starts: Integers) -> Array:
 
 
 def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths: Truths) -> Iterator[_Quantity]:
-    case, desired, error = case_of(settings), ticks.desired, ticks.attitude_error
-
-    def title(name: str, quantity: str) -> str:
-        number = NUMBERS[case].get(name)
-        return f"{f'Figure {number}: ' if number else ''}{quantity} {CASES[case]}"
+    desired, error, found = ticks.desired, ticks.attitude_error, theorem.findings
 
     def true(row: int) -> Array:
         """A row of the true states: interpolated between them, for drawing only, and NaN before the first."""
@@ -117,24 +106,24 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths:
     angles = np.unwrap(euler_deg(desired), period=360.0, axis=0)
     measured, actual = (
         angles + (euler_deg(q) - angles + 180.0) % 360.0 - 180.0  # ±360°, nearest to the desired angles
-        for q in (ticks.attitude, np.column_stack([true(row) for row in range(3, 7)]))
+        for q in (ticks.attitude, np.column_stack([true(row) for row in range(2, 6)]))
     )
     lines = {"measured": measured, "desired": angles, "true": actual}
     yield "angles", "Roll, pitch and yaw", ("roll", "pitch", "yaw"), "°", lines
     lines = {"measured": of_nearer_sign(ticks.attitude, desired), "desired": desired}
-    yield "attitude", title("attitude", "Attitude"), ("η", "ε₁", "ε₂", "ε₃"), "1", lines
+    yield "attitude", "Attitude", ("η", "ε₁", "ε₂", "ε₃"), "1", lines
     lines = {"measured": ticks.rate, "desired": ticks.desired_rate}
-    yield "rate", title("rate", "Angular velocity"), ("ω₁", "ω₂", "ω₃"), "rad/s", lines
-    yield "attitude_error", title("error", "Attitude error"), ("ε̃₁", "ε̃₂", "ε̃₃"), "1", {"measured": error}
+    yield "rate", "Angular velocity", ("ω₁", "ω₂", "ω₃"), "rad/s", lines
+    yield "error", "Attitude error", ("ε̃₁", "ε̃₂", "ε̃₃"), "1", {"measured": error}
     lines = {"measured": ticks.rate_error}
-    yield "rate_error", title("rate_error", "Angular velocity error"), ("ω_e1", "ω_e2", "ω_e3"), "rad/s", lines
+    yield "rate_error", "Angular velocity error", ("ω_e1", "ω_e2", "ω_e3"), "rad/s", lines
     inputs = ["u" + "₁₂₃₄₅₆₇₈"[i - 1] for i in settings.wire.motors]
-    yield "input", title("input", "Input"), inputs, "V", {"commanded": ticks.voltages}
-    lines = {"measured": error_deg(error), "true": true(2)}
+    yield "input", "Input", inputs, "V", {"commanded": ticks.voltages}
+    lines = {"measured": error_deg(error), "true": true(1)}
     yield "error_angle", "Attitude error, as an angle", ["angle"], "°", lines
     if not settings.loop.lockstep:
-        yield "latency", "Loop latency", ["latency"], "µs", {"latency": ticks.latency_ns * 1e-3}
-        yield "period", "Period between measurements", ["period"], "µs", {"period": periods_ns(ticks) * 1e-3}
+        yield "latency", "Loop latency", ["latency"], "ms", {"latency": ticks.latency_ns * 1e-6}
+        yield "period", "Period between measurements", ["period"], "ms", {"period": periods_ns(ticks) * 1e-6}
     law, at = law_of(settings.law, settings.loop.period, settings.wire.actuators), 0
     for name, values in initial_state(law).items():
         if name != "sign":  # of the equilibrium
@@ -143,26 +132,13 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths:
             lines, unit = {"estimated": ticks.state[:, at : at + len(values)]}, law.units.get(name, "1")
             yield name, name.replace("_", " ").capitalize(), labels, unit, lines
         at += len(values)
-    if isinstance(settings.law, AdaptiveSettings):
-        found, period = theorem.findings, settings.loop.period
-        until = inf if found.until_s is None else found.until_s / period
-        judged = (ticks.k >= found.since_s / period) & (ticks.k < until)
-        norm, V = _norm(ticks, settings.law)
-        lines = {"measured": norm, "true": true(0)}
+    if found.holds is not None and len(theorem.true_k):
+        period, until = settings.loop.period, inf if found.until_s is None else found.until_s
+        lines = {"true": true(0)}
         if found.pointwise_radius is not None:
+            judged = (ticks.k >= found.since_s / period) & (ticks.k < until / period)
             lines["bound, once within it"] = np.where(judged, found.pointwise_radius, np.nan)
-        yield "z_norm", "Error of Theorem 1", ["‖z‖"], "1", lines
-        lines = {"measured, without θ̃": V, f"true, {'with' if theorem.damping_known else 'without'} θ̃": true(1)}
-        yield "lyapunov", "Lyapunov function", ["V"], "N·m", lines
+        yield "theorem", "Error of Theorem 1", ["‖z‖"], "1", lines
     for signal, its in truths.signals.items():
         lines = {"true": np.asarray(np.interp(ticks.k, truths.k, its, left=np.nan))}  # for drawing only
         yield "signals", "The plant's own signals", [signal], "1", lines
-
-
-def _norm(ticks: Ticks, law: AdaptiveSettings) -> tuple[Array, Array]:
-    """‖z^Q‖ and its V without θ̃ (C.24), from the errors that the controller computed. Shapes (n,)."""
-    sign, gain, _ = signals(ticks, law)
-    eta_e = (ticks.attitude * ticks.desired).sum(axis=1)  # (C.32)
-    z1 = (1 - sign * eta_e) ** 2 + (ticks.attitude_error**2).sum(axis=1)  # (C.39), its square
-    z2 = (ticks.rate_error + sign[:, None] * gain * ticks.attitude_error) ** 2  # (C.40); G z₁ = ±ε̃ by (C.49)
-    return np.sqrt(z1 + z2.sum(axis=1)), z1 + z2 @ np.array(law.inertia) / 2

@@ -1,14 +1,13 @@
-"""Report of a run as data: what `log review --json` prints and what its page draws.
+"""Report of a run as data: what `log review --json` prints (`Findings`) and what its page draws.
 
-A `Report` has figures, events, and lines: of minutes every tick, of hours an outline. review.py fills it; it does
-not depend on how it is shown.
+review.py fills it; it does not depend on how it is shown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from pydantic import BaseModel, Field
 
@@ -17,10 +16,10 @@ from aeroloop.service.logs.session import Array, Missing, Unknown
 
 
 class Spread(BaseModel, frozen=True):
-    """Distribution of a duration: percentiles, and a histogram of bins 4.4 % wide."""
+    """Distribution of a duration: percentiles [µs], and a histogram of bins 4.4 % wide."""
 
     count: int
-    p50: float = Field(description="[µs]")
+    p50: float
     p90: float
     p99: float
     p999: float
@@ -29,9 +28,9 @@ class Spread(BaseModel, frozen=True):
 
 
 class Gap(BaseModel, frozen=True):
-    """Ticks in a row that no command answered."""
+    """Ticks in a row that no command answered: when the first was [s], its number, how many."""
 
-    time_s: float = Field(description="the first of them, on the law's clock [s]")
+    time_s: float
     tick: int
     ticks: int
 
@@ -57,27 +56,27 @@ class FaultInterval(BaseModel, frozen=True):
 
 
 class Recorded(BaseModel, frozen=True):
-    """A session in the log."""
+    """A session in the log, and the time from its controller's first to its last row [s]."""
 
     vehicle: str
     session: str
-    duration_s: float = Field(description="from the controller's first to its last row [s]")
+    duration_s: float
 
 
 class Disagreement(BaseModel, frozen=True):
-    """A key of the configuration that the two ends have different values of; each acts by its own."""
+    """A dotted key of the configuration that the two ends have different values of; each acts by its own."""
 
-    key: str = Field(description="dotted, such as `plant.aero.mass`")
+    key: str
     controller: Any
     plant: Any
 
 
 class Check(BaseModel, frozen=True):
-    """A limit, and whether it holds."""
+    """A limit such as `z_track ≤ 0.005 s`, whether it holds, and what was found, with its unit."""
 
-    text: str = Field(description="such as `z_track ≤ 0.005`")
+    text: str
     holds: bool
-    found: str = Field(description="what was found, with its unit")
+    found: str
 
 
 class LemmaCheck(BaseModel, frozen=True):
@@ -93,34 +92,29 @@ class LemmaCheck(BaseModel, frozen=True):
 
 
 class TheoremFindings(BaseModel, frozen=True):
-    """What is proven of a session, and whether the session kept to it."""
+    """What is proven of a session, and whether the session kept to it. Times are on the law's clock [s]."""
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
     holds: bool | None = Field(default=None, description="null where nothing can be promised")
     held: bool | None = Field(description="whether the run kept to all of it that could be judged")
-    pointwise_radius: float | None = Field(
-        default=None, description="bound of ‖z‖ in the end [1, rad/s]; null unless certified"
-    )
+    pointwise_radius: float | None = Field(default=None, description="bound of ‖z‖ in the end [1, rad/s], if certified")
     pointwise_deg: float | None = Field(default=None, description="the attitude error within that bound [deg]")
     pointwise_share: float | None = Field(
-        default=None,
-        description="largest true ‖z‖ as a share of the bound that holds once it was so small; it never exceeds 1",
+        default=None, description="largest true ‖z‖ as a share of the bound that holds once it was so small; at most 1"
     )
-    pointwise_at_s: float | None = Field(default=None, description="when that was, on the law's clock [s]")
+    pointwise_at_s: float | None = Field(default=None, description="when that was")
     pointwise_judged: int = Field(default=0, description="true states that judged it")
-    pointwise_since_s: float | None = Field(default=None, description="from when on, on the law's clock [s]")
+    pointwise_since_s: float | None = Field(default=None, description="from when on")
     pointwise_bound: float | None = Field(default=None, description="the least bound that judged [1, rad/s]")
-    since_s: float = Field(description="judged from when the reference was reached, on the law's clock [s]")
-    until_s: float | None = Field(description="judged until gains or reference changed [s]; null: to the end")
+    since_s: float = Field(description="judged from when the reference was reached")
+    until_s: float | None = Field(description="judged until gains or reference changed; null: to the end")
     samples: int = Field(description="true states that belong to a tick that is judged")
     outside: dict[str, int] = Field(
         default={},
-        description="how many of them do not satisfy a premise: (C.28) and (C.29), that sensors err by no more than "
-        "the quantizers, (C.30), that the command is not saturated, and Assumption 3, the assumed attitude error",
+        description="how many of them do not satisfy a premise: (C.28), (C.29): sensors err by no more than the "
+        "quantizers; (C.30): the command is not saturated; Assumption 3: the assumed attitude error",
     )
-    judged: int = Field(
-        default=0, description="how many satisfy all of them; the inequalities are judged by these alone"
-    )
+    judged: int = Field(default=0, description="how many satisfy all of them, and so judge the inequalities")
     lemma: list[LemmaCheck] = []
     broken: int | None = Field(default=None, description="inequalities broken, over all of them and all samples")
 
@@ -132,9 +126,7 @@ class Findings(Figures):
     session: str
     sessions: int = Field(description="the vehicle's sessions in the log; the longest is judged if none is named")
     recorded: list[Recorded] = Field(default_factory=list, description="every session, in the order of recording")
-    disagreements: list[Disagreement] = Field(
-        default_factory=list, description="of loop, wire and plant, between the controller's and the plant's end"
-    )
+    disagreements: list[Disagreement] = Field(default_factory=list, description="of loop, wire and plant")
     started: str = Field(description="when the session's first measurement was sent, UTC")
     timing: dict[str, Spread] = Field(
         description="`period`: between measurements, and `latency`: from a measurement to the command that answers it, "
@@ -164,21 +156,17 @@ class Findings(Figures):
         "(malformed, or without a valid value), `withheld` by a fault"
     )
     marks: list[Mark]
-    faults: list[FaultInterval] = Field(
-        default_factory=list, description="faults of the emulated plant that acted in the session, in order of time"
-    )
+    faults: list[FaultInterval] = Field(default_factory=list, description="that acted at the plant, in order of time")
     theorem: TheoremFindings | None = None
     checks: list[Check] = Field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Line:
-    """One line of a panel: values at the report's times. Shape (n,)."""
+class Line(NamedTuple):
+    """One line of a panel: its values at the report's times, and whether they are desired ones. Shape (n,)."""
 
     label: str
     values: Array
     desired: bool = False
-    """Whether it is the desired value."""
 
     @property
     def held(self) -> bool:
@@ -186,12 +174,8 @@ class Line:
         return not self.desired and not self.label.startswith("true")
 
 
-@dataclass(frozen=True)
-class Panel:
-    """Lines that share an axis, such as `ε̃₁` of the group `attitude_error`; panels of a group stand together.
-
-    The title has the paper's number where the paper has that figure; the unit is `1` if there is none.
-    """
+class Panel(NamedTuple):
+    """Lines that share an axis; panels of a group stand together. The unit is `1` if there is none."""
 
     group: str
     title: str
@@ -207,11 +191,10 @@ class Report:
     Attributes:
         time: Times of every line, on the law's clock [s]. Shape (n,).
         panels: What is drawn over time, in the order of the paper's figures.
-        thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
-            and the largest value.
-        part: The span of the law's clock that was read, if it is not the whole session [s].
+        thinned: Ticks per two points of a line, the least and the largest value; 1 or 2 if nothing was thinned out.
         settings: The effective configuration, as nested tables; each section is of the role that owns it.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
+        part: The span of the law's clock that was read, if it is not the whole session [s].
     """
 
     name: str

@@ -1,6 +1,6 @@
 """Figures of merit of a review: their names, units and forms, and limits of them.
 
-The limit `z_track=50e-4` holds if the figure is at most that, `theorem=1` if it is at least that.
+The limit `z_track=50e-4` holds if the figure is at most that, `theorem.held=1` if it is at least that.
 """
 
 from __future__ import annotations
@@ -25,26 +25,21 @@ def percent(share: float) -> str:
 
 
 _whole, _tenth, _hundredth = "{:,.0f}".format, "{:,.1f}".format, "{:,.2f}".format
-_fourth = "{:.4f}".format
 
 
 class Figure(NamedTuple):
-    """Form of a figure of merit.
-
-    `path` leads to it in the findings, `what` says in a few words what it is, `main` figures are always shown, and
-    those that add up over time (`sums_up`) are comparable only between runs of the same duration. A limit of it is in
-    `limit_unit`, or in `unit` if that is None.
-    """
+    """A figure of merit: its path in the findings, name, unit and form, and in a few words what a main one is."""
 
     path: str
     name: str
     unit: str
-    text: Callable[[float], str]
-    main: bool = False
+    text: Callable[[float], str] = _whole
     what: str = ""
-    less_is_better: bool = True
-    sums_up: bool = False
-    limit_unit: str | None = None
+
+    @property
+    def main(self) -> bool:
+        """Whether it is always shown."""
+        return bool(self.what)
 
     @property
     def key(self) -> str:
@@ -53,76 +48,53 @@ class Figure(NamedTuple):
 
 
 FIGURES: Final = (
-    Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
-            "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured", sums_up=True, limit_unit="s"),
-    Figure("u_total", "control effort u_total", "V²·s", _tenth, True,
-            "∫ uᵀu dt, u the voltages as sent", sums_up=True),
-    Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
-            "angle from measured to desired attitude"),
-    Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
+    Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4),
+           "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured"),
+    Figure("u_total", "control effort u_total", "V²·s", _tenth, "∫ uᵀu dt, u the voltages as sent"),
+    Figure("max_error_deg", "largest attitude error", "°", _hundredth, "angle from measured to desired attitude"),
+    Figure("final_error_deg", "final attitude error", "°", _hundredth, "at the last tick"),
     Figure("second_half_error_deg", "largest attitude error in the second half", "°", _hundredth),
-    Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
-    Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
-    Figure("latency_us.p99", "loop latency p99", "µs", _whole),
-    Figure("latency_us.max", "loop latency, longest", "µs", _whole),
-    Figure("age_us.p50", "age of measurements at the controller, p50", "µs", _whole),
-    Figure("age_us.p99", "age of measurements at the controller, p99", "µs", _whole),
-    Figure("measurement.frames_per_s", "measurements", "frames/s", _tenth, less_is_better=False),
-    Figure("measurement.bits_per_s", "measurements", "bit/s", _whole, True, "payload from plant to controller", False),
-    Figure("command.frames_per_s", "commands", "frames/s", _tenth, less_is_better=False),
-    Figure("command.bits_per_s", "commands", "bit/s", _whole, True, "payload from controller to plant", False),
-    Figure("gap_count", "gaps", "", _whole, sums_up=True),
-    Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent, limit_unit=""),
-    Figure("saturated.rate", "rate at the quantizer's limit", "%", percent, limit_unit=""),
-    Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent, limit_unit=""),
-    Figure("invalid", "frames without a valid value", "", _whole, sums_up=True),
-    Figure("missing_ticks", "ticks that were not recorded", "", _whole, sums_up=True),
-    Figure("lapses", "late, missed, malformed, stale, refused", "", _whole, sums_up=True),
-    Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
-    Figure("trips", "trips", "", _whole, sums_up=True),
-    Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
-    Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent, limit_unit=""),
-    Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
-    Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
-    Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
-    Figure("duration_s", "duration", "s", seconds, less_is_better=False),
+    Figure("skipped_ticks", "skipped ticks", "", what="ticks without a command"),
+    Figure("latency_us.p50", "loop latency p50", "µs", what="measurement sent to command received, median"),
+    Figure("latency_us.p99", "loop latency p99", "µs"),
+    Figure("latency_us.max", "loop latency, longest", "µs"),
+    Figure("measurement.bits_per_s", "measurements", "bit/s", what="payload from plant to controller"),
+    Figure("command.bits_per_s", "commands", "bit/s", what="payload from controller to plant"),
+    Figure("gap_count", "gaps", ""),
+    Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent),
+    Figure("saturated.rate", "rate at the quantizer's limit", "%", percent),
+    Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent),
+    Figure("invalid", "frames without a valid value", ""),
+    Figure("missing_ticks", "ticks that were not recorded", ""),
+    Figure("lapses", "late, missed, malformed, stale, refused", ""),
+    Figure("losses", "messages the recorder lost", ""),
+    Figure("trips", "trips", ""),
+    Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
+    Figure("theorem.broken", "inequalities of Lemma 1 broken", ""),
+    Figure("duration_s", "duration", "s", seconds),
 )  # fmt: skip
 
-_TIMING: Final = [
-    f"timing.{name}.{percentile}"
-    for name in ("latency", "period", "measurement_delay", "command_delay")
-    for percentile in ("p50", "p90", "p99", "p999", "max")
-]
+_DURATIONS: Final = [
+    *(f"latency_us.{percentile}" for percentile in ("p50", "p99", "p999", "max")),
+    *(f"age_us.{percentile}" for percentile in ("p50", "p99", "max")),
+    *(f"timing.{name}.{percentile}"
+      for name in ("latency", "period", "measurement_delay", "command_delay")
+      for percentile in ("p50", "p90", "p99", "p999", "max")),
+]  # fmt: skip
 
-UNITS: Final = {
-    **{
-        figure.path: figure.unit if figure.limit_unit is None else figure.limit_unit
-        for figure in FIGURES
-        if figure.key not in ("measurement", "command")
-    },
-    **dict.fromkeys(("latency_us.p999", "age_us.max", *_TIMING), "µs"),
-    "damages": "",
-}
-"""Figures that can have a limit, by their names in the findings, and the limit's unit."""
-
-SHORT: Final[dict[str, str]] = {
-    "skipped": "skipped_ticks",
-    "gaps": "gap_count",
-    "theorem": "theorem.held",
-    "lemma_broken": "theorem.broken",
-    **{path.partition(".")[2]: path for path in UNITS if path.startswith(("timing.", "theorem.pointwise_"))},
-    **{path.replace("_us", ""): path for path in UNITS if path.startswith("age_us.")},
-}
-"""Other names for some of them."""
-
-NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
-"""Names that `--require` lists."""
-
-UNSEEN_SHOWN: Final = 3
-"""Of what a figure does not see, so many are listed in its line."""
+LIMITED: Final = {
+    **{figure.path: {"×10⁻⁴ s": "s", "%": ""}.get(figure.unit, figure.unit)
+       for figure in FIGURES if figure.unit != "bit/s"},
+    **dict.fromkeys(_DURATIONS, "µs"),
+    "damages": "", "theorem.held": "", "theorem.pointwise_radius": "", "theorem.pointwise_deg": "°",
+}  # fmt: skip
+"""Figures that can have a limit, by their paths in `--json`, and the limit's unit."""
 
 AT_LEAST: Final = ("theorem.held",)
 """Figures of which more is better."""
+
+UNSEEN_SHOWN: Final = 3
+"""Of what a figure does not see, so many are listed in its line."""
 
 
 class LimitError(AeroloopError):
@@ -144,24 +116,19 @@ def value_of(figures: Figures, path: str) -> float | None:
 class Limit(NamedTuple):
     """Upper limit of a figure, as `value_of` finds it; of those in AT_LEAST a lower limit."""
 
-    figure: str
+    path: str
     bound: float
 
     @classmethod
     def parse(cls, text: str) -> Limit:
         """A limit as the command line gives it. Raises LimitError."""
-        name, equals, value = text.partition("=")
-        if not equals or not (name in SHORT or name in UNITS):
-            raise LimitError(f"--require takes FIGURE=LIMIT, not {text!r}; figures are {', '.join(NAMES)}")
+        path, equals, value = text.partition("=")
+        if not equals or path not in LIMITED:
+            raise LimitError(f"--require takes FIGURE=LIMIT, not {text!r}; figures are {', '.join(LIMITED)}")
         try:
-            return cls(name, float(value))
+            return cls(path, float(value))
         except ValueError:
-            raise LimitError(f"--require {name} takes a number, not {value!r}") from None
-
-    @property
-    def path(self) -> str:
-        """The figure's name in the findings."""
-        return SHORT.get(self.figure, self.figure)
+            raise LimitError(f"--require {path} takes a number, not {value!r}") from None
 
     def holds(self, figures: Figures) -> bool:
         """Whether the figure is within the limit; an unavailable one is not."""
@@ -174,7 +141,7 @@ class Limit(NamedTuple):
         A limit that seems to hold does not where ticks or parts of files are unseen, unless `limits`, which are
         required together with it, permit as many `missing_ticks` or `damages`.
         """
-        value, unit = value_of(findings, self.path), UNITS[self.path]
+        value, unit = value_of(findings, self.path), LIMITED[self.path]
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if f"{self.path}.".startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
@@ -185,11 +152,9 @@ class Limit(NamedTuple):
             more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
             permits = " ".join(f"--require {figure}={value_of(findings, figure):g}" for figure in unseen)
             found += f", but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
-        return Check(
-            text=f"{self.figure} {'≥' if self.path in AT_LEAST else '≤'} {self.bound:g}{space}{unit}",
-            holds=self.holds(findings) and not unseen,
-            found=found,
-        )
+        sign = "≥" if self.path in AT_LEAST else "≤"
+        holds = self.holds(findings) and not unseen
+        return Check(text=f"{self.path} {sign} {self.bound:g}{space}{unit}", holds=holds, found=found)
 
 
 def broken_limits(findings: Findings) -> list[str]:

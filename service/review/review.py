@@ -38,11 +38,7 @@ OWN_AFFAIRS: Final = (
 
 @dataclass(frozen=True)
 class Review:
-    """Review of a session: the figures of merit alone, and with everything else the findings.
-
-    The ticks are those that are judged. A run has the name of its file or folder, without the ending; its facts are
-    about software and host, by role. `part` is from when to when it was read [s]; None if all of it was.
-    """
+    """Review of a session. The ticks are those that are judged; `part` is from when to when it was read [s]."""
 
     figures: Figures
     findings: Findings
@@ -70,11 +66,6 @@ def review(*paths: Path) -> Figures:
     return read(*paths).figures
 
 
-def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
-    """Report of a run's longest session, checked against limits. Raises as `read` does."""
-    return read(*paths, progress=progress).report(limits)
-
-
 def read(
     *paths: Path,
     session: str | None = None,
@@ -83,18 +74,10 @@ def read(
     since_s: float = -inf,
     until_s: float = inf,
 ) -> Review:
-    """Read a run and judge a session. The figures list what cannot be read of a broken file.
+    """Read a run (logs, folders, or the files of a rotated run) and judge a session, or of it what is in this time [s].
 
-    Args:
-        paths: Logs, folders of logs, or the files of a rotated run.
-        session: As of `Recording.choose`.
-        vehicle: As of `Recording.choose`.
-        progress: Called repeatedly with the share done, 0…1.
-        since_s: From when on to read the session, on the law's clock [s].
-        until_s: Until when [s].
-
-    Raises:
-        ReviewError: Not a log, several unrelated runs, no such session, or nothing of it in this time.
+    Session and vehicle are as of `Recording.choose`, the time is the law's. Raises ReviewError: Not a log, several
+    unrelated runs, no such session, or nothing of it in this time.
     """
     try:
         recording = Recording(paths, progress)

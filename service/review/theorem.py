@@ -12,7 +12,7 @@ A command that is missing or not within (C.30) ends what the true states before 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf, nan
+from math import ceil, inf, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,26 +22,21 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Flags, Ticks
-from aeroloop.service.review.events import Truths, judged_ticks
+from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem import bounds as lemma
 from aeroloop.service.theorem.certificate import promise
-from aeroloop.service.theorem.feedback import Feedback
 from aeroloop.service.theorem.invariant import Premises, distance, reach
 
 
 class TheoremCheck(NamedTuple):
-    """Findings, why each that is null is so, and of m true states the ticks, and ‖z‖, V [N·m], error [deg] and q.
-
-    V has its θ̃ term where the plant's θ is known. Shapes (m,) and (7, m).
-    """
+    """Findings, why each that is null is so; of m true states the ticks, and ‖z‖, error [deg] and q: (m,), (6, m)."""
 
     findings: TheoremFindings
     reasons: dict[str, str]
     true_k: Integers
     true: Array
-    damping_known: bool
 
 
 def check_theorem(
@@ -62,14 +57,17 @@ def check_theorem(
 
     _, place, its = np.intersect1d(ticks.k, truths.k, assume_unique=True, return_indices=True)
     at, omega, q = ticks.where(place), truths.rate[its], truths.attitude[its]
-    sign, gain, estimate = signals(at, law, None if e is None else e.plant.law)
+    if law is not None:  # by the order of `Adaptive.initial` and `Adaptive.gains`
+        sign, gain, estimate = at.state_next[:, 3], at.gains[:, :3], at.state[:, :3]
+    else:
+        sign = np.where((at.attitude * at.desired).sum(axis=1) < 0, -1.0, 1.0)
+        gain, estimate = np.full((2, 3), nan) if e is None else np.array([e.plant.law.share, e.plant.law.centre])
     omega_d = lemma.times(lemma.rotation(at.attitude), at.desired_rate)
     x = lemma.Samples(of_nearer_sign(q, at.attitude), omega, at.attitude, at.rate, at.desired, omega_d, sign)
     b = lemma.coordinates(x.q, omega, x.q_d, omega_d, sign, gain)
-    theta = None if e is None else e.bounds.theta
+    theta = None if e is None else e.plant.plant.theta
     theta_error = np.zeros((1, 3)) if theta is None else theta - estimate
-    V = b.norm if law is None else lemma.lyapunov(b, theta_error, law)
-    true = np.vstack([b.norm, V, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
+    true = np.vstack([b.norm, error_deg(b.eps_e), of_nearer_sign(q, at.desired).T])
 
     time, within = np.asarray(at.k * period, np.float64), (at.k >= since) & (at.k < until)
     found: dict[str, Any] = {"samples": int(within.sum())}
@@ -84,7 +82,7 @@ def check_theorem(
             known, bounds, _ = e.paper
             sides = {one.equation: one for one in lemma.lemma_inequalities(x, law, known, bounds)}
             unmet = {name: sides.pop(name).broken for name in ("C.28", "C.29")} | {"C.30": refused[place]}
-            unmet["Assumption 3"] = true[2] > np.degrees(2 * known.half_angle_e) * (1 + 1e-9)
+            unmet["Assumption 3"] = true[1] > np.degrees(2 * known.half_angle_e) * (1 + 1e-9)
             found["outside"] = {name: int((within & where).sum()) for name, where in unmet.items()}
             if (met := within & ~np.any(list(unmet.values()), axis=0)).any():
                 checks = [_lemma_check(one, met, time) for one in sides.values()]
@@ -101,7 +99,19 @@ def check_theorem(
     kept = [found[name] <= most for name, most in (("broken", 0), ("pointwise_share", 1)) if name in found]
     found |= {"since_s": round(since * period, 9), "until_s": None if until == inf else round(until * period, 9)}
     findings = TheoremFindings(verdict=verdict, held=all(kept) if kept else None, **found)
-    return TheoremCheck(findings, _reasons(findings, faults), at.k, true, theta is not None)
+    return TheoremCheck(findings, _reasons(findings, faults), at.k, true)
+
+
+def judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
+    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
+    since, begun = 0, set[str]()
+    for change in changes:
+        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
+        if change.start is None and begun == {"gains", "reference"}:
+            return since, change.tick
+        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
+        since = max(since, change.tick + ceil(change.within_s / period))
+    return since, inf
 
 
 def _lemma_check(one: lemma.Inequality, judged: Flags, time: Array) -> LemmaCheck:
@@ -144,12 +154,3 @@ def _reasons(found: TheoremFindings, faults: bool) -> dict[str, str]:
         the_set = "the certificate does not hold"
     names = [name for name, value in found if value is None and name.startswith(("broken", "held", "pointwise_"))]
     return {f"theorem.{name}": the_set if name.startswith("pointwise_") else lemma_1 for name in names}
-
-
-def signals(ticks: Ticks, law: AdaptiveSettings | None, feedback: Feedback | None = None) -> tuple[Array, Array, Array]:
-    """±1 of the equilibrium approached, c of z₂ [1/s], θ̂ as used [N·m·s/rad]; NaN where there is none. (n, …)."""
-    if law is not None:  # by the order of `Adaptive.initial` and `Adaptive.gains`
-        return ticks.state_next[:, 3], ticks.gains[:, :3], ticks.state[:, :3]
-    nearer = np.where((ticks.attitude * ticks.desired).sum(axis=1) < 0, -1.0, 1.0)
-    constant = np.full((2, 3), nan) if feedback is None else np.array([feedback.share, feedback.centre])
-    return nearer, *np.repeat(constant[:, None], len(ticks.k), axis=1)

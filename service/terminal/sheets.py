@@ -13,22 +13,16 @@ if TYPE_CHECKING:
     from aeroloop.protocol.wire.spec import WireSpec
     from aeroloop.service.host.doctor import Diagnosis
     from aeroloop.service.host.keys import KeyFile
-    from aeroloop.service.theorem.certificate import Certificate, CustomCertificate
+    from aeroloop.service.theorem.certificate import Certificate
 
 DECIDING: Final = (
-    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "‖w_q‖", "τ_h of the plant"
+    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "‖w_s‖", "‖w_f‖", "‖w_q‖", "τ_h of the plant"
 )  # fmt: skip
 """Symbols of a certificate's terms that are shown unless --verbose: what goes in, what decides, what comes out."""
 
 
-def certificate_sheets(certificate: Certificate | CustomCertificate, verbose: bool = False) -> Sheets:
-    """A certificate, with all of its terms if verbose; of a user's law, what it says."""
-    from aeroloop.service.theorem.certificate import CustomCertificate
-
-    if isinstance(certificate, CustomCertificate):
-        said = certificate.model_extra or {}
-        yield certificate.verdict, [{"": name, "value": str(value)} for name, value in said.items()]
-        return
+def certificate_sheets(certificate: Certificate, verbose: bool = False) -> Sheets:
+    """A certificate, with all of its terms if verbose."""
     yield "\n  ".join([certificate.verdict, *certificate.violated[1:]]), []
     proven = (
         ("paper's body, at every instant", certificate.pointwise_radius, certificate.pointwise_deg),

@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
 from aeroloop.service.logs.mcap_file import messages
 from aeroloop.service.review.report import Findings
-from aeroloop.service.review.review import read, report
+from aeroloop.service.review.review import read
 from aeroloop.service.testing.process_group import HilError
 from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
 
@@ -119,7 +119,7 @@ class HilLog:
         try:
             from aeroloop.service.report.page import page
 
-            shown.write_text(page([report([self.path])]), encoding="utf-8")
+            shown.write_text(page([read(self.path).report()]), encoding="utf-8")
         except Exception as error:  # the same; and without the extra `review` there is no page
             yield f"no page: {type(error).__name__}: {error}".splitlines()[0]
         else:

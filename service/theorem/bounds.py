@@ -1,15 +1,8 @@
-"""Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper.
+"""Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper, and both sides of each at given states.
 
-    symbol     name in code             symbol     name in code             symbol   name in code
-    ‖δ_ε‖      delta_eps                k_ω_d      k_omega_d                ‖δ_z2‖   delta_z2
-    ‖δ_ω‖      delta_omega              k_ω̇_d      k_omega_d_dot            δ_ᾱ1     delta_alpha1
-    ‖δ_u‖      delta_u                  k_ω_e      k_omega_e                λ_max(J) lambda_J
-    k_θ        k_theta                  ‖δ_ω_e‖    delta_omega_e            C₁ C₂    least and largest element
-
-`Known`, `Lemma` and `Theorem` hold each quantity's meaning, unit and equation; a certificate prints them. The paper
-weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here.
-
-Where the paper's text cannot be evaluated as printed, it is read as follows:
+`Known`, `Lemma` and `Theorem` hold each quantity's symbol, equation, unit and meaning; a certificate prints them. The
+paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here. The paper's text is read
+as follows where it cannot be evaluated as printed:
 
 - (C.50), (C.51) and (C.58), (C.59) compare vectors with ≤; they are read with norms. The δ_ωe of (C.58) is then
   δ_R k_ωd + δ_ω, with the k_ε² of (C.61).
@@ -23,16 +16,15 @@ Where the paper's text cannot be evaluated as printed, it is read as follows:
 - k of (C.66) is the largest allowed: the margin itself.
 - (C.26) has k_ω_e = 1 + λ_max(C₁); ω_e = z₂ − C₁ε̃ gives √(1 + λ_max(C₁)²). (C.56) has λ_max(C₁) k_ω_e; since e ↦ η̃ I
   + S(ε̃) is linear and of norm ‖e‖, the difference is ½ λ_max(C₁) δ_q k_ω_e, which vanishes without quantization.
-- (C.68) does not follow: V contains θ̃, so the ball is no level set of V. What (C.77) proves is the mean square,
-  (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, so √(δ_Q/k) is the root of the mean square in the long run, of a law in continuous
-  time. `invariant` has a bound at every instant, of the sampled one.
+- (C.68) does not follow: V of (C.24), (C.73) contains θ̃, so the ball is no level set of V. What (C.77) proves is the
+  mean square, (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, in continuous time. `invariant` has a bound at every instant.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, pi, sin, sqrt
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,33 +59,10 @@ class Known:
     k_omega_d: Annotated[float, Term("k_ω_d", "Assumption 1", "rad/s", "largest ‖ω_d‖ of the reference")]
     k_omega_d_dot: Annotated[float, Term("k_ω̇_d", "Assumption 1", "rad/s²", "largest ‖ω̇_d‖ of the reference")]
     half_angle_d: Annotated[float, Term("max ∡q_d/2", "C.16", "rad", "largest angle of the reference, halved")]
-    half_angle_e: Annotated[
-        float,
-        Term(
-            "max ∡e/2",
-            "Assumption 3",
-            "rad",
-            "assumed: the attitude error stays below twice this; 20° unless stated in Python, within which "
-            "sessions begin; at least that of the invariant set",
-        ),
-    ]
-    k_theta: Annotated[
-        float, Term("max ‖θ‖", "Assumption 2", "N·m·s/rad", "assumed: within law.damping_bound of law.damping_estimate")
-    ]
-    k_theta_err: Annotated[
-        float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "k_θ + k_θ/0.95: θ by Assumption 2, θ̂ by the projection")
-    ]
-    k_tau_d: Annotated[
-        float,
-        Term("k_τ_d", "C.78", "N·m", "largest ‖τ_d‖: --disturbance, and what the plant's settings say; 0 is Theorem 1"),
-    ]
-    omega_limit: Annotated[
-        float,
-        Term("max |ω_k|", "C.29", "rad/s", "assumed of Lemma 1: within wire.rate.limit"),
-    ]
-    u_limit: Annotated[
-        float, Term("max |u_k|", "C.30", "V", "assumed: within wire.voltage.limit; a log counts the commands beyond it")
-    ]
+    half_angle_e: Annotated[float, Term("max ∡e/2", "Assumption 3", "rad", "assumed: 20° or that of the set, halved")]
+    k_theta: Annotated[float, Term("max ‖θ‖", "Assumption 2", "N·m·s/rad", "assumed: by law.damping_bound")]
+    k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "θ by Assumption 2, θ̂ by the projection")]
+    k_tau_d: Annotated[float, Term("k_τ_d", "C.78", "N·m", "largest ‖τ_d‖; 0 is Theorem 1")]
 
 
 @dataclass(frozen=True)
@@ -119,28 +88,17 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1, in continuous time. The last two are None where (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1, in continuous time; `radius` is None where (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
-    coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
-    alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
     delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q due to θ̃")]
     delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 due to θ and θ̃")]
     delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "quantization's effect as a torque")]
     delta_Q: Annotated[float, Term("δ_Q", "C.69", "W", "constant of V̇ ≤ −k ‖z‖² + δ_Q without a disturbance")]
     delta_Qdist: Annotated[float, Term("δ_Qdist", "C.80", "W", "the same with the disturbance")]
-    margin: Annotated[float, Term("c₀/2 − δ_V1", "C.66", "N·m·s/rad", "positive where the theorem holds")]
-    k: Annotated[float | None, Term("k", "C.66", "N·m·s/rad", "rate at which V decreases, per ‖z‖²")]
-    radius: Annotated[
-        float | None,
-        Term(
-            "√(δ_Q/k)",
-            "C.68, C.79",
-            "1, rad/s",
-            "root of the mean of ‖z‖² in the long run, with the disturbance, of a law in continuous time",
-        ),
-    ]
+    margin: Annotated[float, Term("c₀/2 − δ_V1", "C.66", "N·m·s/rad", "k, positive where the theorem holds")]
+    radius: Annotated[float | None, Term("√(δ_Q/k)", "C.68, C.79", "1, rad/s", "mean ‖z‖ in continuous time, with τ_d")]
 
 
 def lemma_1(p: Known) -> Lemma:
@@ -169,14 +127,10 @@ def lemma_1(p: Known) -> Lemma:
 
 
 def attitude_error(delta_eps: float, half_angle: float) -> float:
-    """The largest ‖q^Q − q‖, a bound of d_ε of (C.31) and of d_ε̃ of (C.33).
+    """The largest ‖q^Q − q‖, a bound of d_ε of (C.31) and of d_ε̃ of (C.33), for a body turned at most 2 `half_angle`.
 
     η = √(1 − ‖ε‖²) is steepest at large ‖ε‖, so its error is largest where ‖ε‖ is largest and ε^Q lies outside of it.
     Scaling to unit length (Remark 2) brings ε^Q nearer to ε.
-
-    Args:
-        delta_eps: ‖δ_ε‖.
-        half_angle: Half the body's largest angle from q = [1, 0]; at most π/2 [rad].
     """
     outer = min(1.0, sin(half_angle) + delta_eps)
     inner = max(0.0, outer - delta_eps)
@@ -187,8 +141,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     """Condition and bounds of Theorem 1; with a disturbance, of Corollary 1."""
     least_share = (1 + cos(p.half_angle_e)) / 2  # ‖ε̃‖²/‖z₁‖²: 1 where e is small, ½ where η̃ = 0
     c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
-    coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
-    delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
+    delta_V1 = d.delta_Psi2 + d.delta_S2 * p.lambda_J * p.k_omega_d + d.delta_alpha2 * p.lambda_J  # (C.67)
     delta_theta1 = p.k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
     delta_theta2 = p.k_theta * p.delta_omega + p.k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
     delta_V2 = (
@@ -204,65 +157,27 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
     delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d) ** 2 / (2 * c0)  # (C.80)
     margin = c0 / 2 - delta_V1  # (C.66)
-    holds = margin > 0
-    radius = sqrt(delta_Qdist / margin) if holds else None  # (C.68), (C.79)
-    return Theorem(
-        c0=c0,
-        coriolis=coriolis,
-        alpha=alpha,
-        delta_V1=delta_V1,
-        delta_theta1=delta_theta1,
-        delta_theta2=delta_theta2,
-        delta_V2=delta_V2,
-        delta_Q=delta_Q,
-        delta_Qdist=delta_Qdist,
-        margin=margin,
-        k=margin if holds else None,
-        radius=radius,
-    )
+    radius = sqrt(delta_Qdist / margin) if margin > 0 else None  # (C.68), (C.79)
+    return Theorem(c0, delta_V1, delta_theta1, delta_theta2, delta_V2, delta_Q, delta_Qdist, margin, radius)
 
 
 # ── Lemma 1 sample by sample: both sides of each inequality, for true and received states ──
-#
-#    symbol   name in code     unit, shape        symbol   name in code     unit, shape
-#    q, ω     q, omega         1, rad/s; (n, 4)   z₁, z₂   z1, z2           1 (n, 4), rad/s (n, 3)
-#    q^Q, ω^Q q_Q, omega_Q     the same           ω_e      omega_e          rad/s (n, 3)
-#    q_d, ω_d q_d, omega_d     ω_d inertial       R_i^b    R                1 (n, 3, 3)
 
 
-@dataclass(frozen=True)
-class Samples:
-    """True states of the body and the states as received, at n instants.
+class Samples(NamedTuple):
+    """True states of the body and the states as received, at n instants; rates in rad/s."""
 
-    Attributes:
-        q: True attitude, unit length, of either sign. Shape (n, 4).
-        omega: True angular velocity, body frame [rad/s]. Shape (n, 3).
-        q_Q: Attitude as received, scaled by Remark 2, with the sign chosen by the law. Shape (n, 4).
-        omega_Q: Angular velocity as received [rad/s]. Shape (n, 3).
-        q_d: Desired attitude. Shape (n, 4).
-        omega_d: Desired angular velocity, inertial frame [rad/s]. Shape (n, 3).
-        sign: ±1, the equilibrium approached. Shape (n,).
-    """
-
-    q: Floats
-    omega: Floats
-    q_Q: Floats
-    omega_Q: Floats
-    q_d: Floats
-    omega_d: Floats
-    sign: Floats
+    q: Floats  # true attitude, of either sign, (n, 4)
+    omega: Floats  # true ω, body frame, (n, 3)
+    q_Q: Floats  # attitude as received, scaled by Remark 2, with the sign chosen by the law, (n, 4)
+    omega_Q: Floats  # ω as received, (n, 3)
+    q_d: Floats  # desired attitude, (n, 4)
+    omega_d: Floats  # ω_d, inertial frame, (n, 3)
+    sign: Floats  # ±1, the equilibrium approached, (n,)
 
 
-@dataclass(frozen=True)
-class Inequality:
-    """One inequality at n instants.
-
-    Attributes:
-        equation: Its number.
-        what: Its left-hand side, in the paper's symbols.
-        left: Shape (n,).
-        right: Shape (n,).
-    """
+class Inequality(NamedTuple):
+    """One inequality at n instants: its number, its left-hand side in the paper's symbols, both sides (n,)."""
 
     equation: str
     what: str
@@ -275,16 +190,15 @@ class Inequality:
         return self.left > self.right * (1 + 1e-9) + 1e-12
 
 
-@dataclass(frozen=True)
-class Coordinates:
-    """The error coordinates of the law at n instants, as in the table above. `A` is η̃ I + S(ε̃)."""
+class Coordinates(NamedTuple):
+    """The error coordinates of the law at n instants. `A` is η̃ I + S(ε̃)."""
 
-    R: Floats
-    omega_e: Floats
-    eps_e: Floats
-    A: Floats
-    z1: Floats
-    z2: Floats
+    R: Floats  # R_i^b, (n, 3, 3)
+    omega_e: Floats  # (n, 3)
+    eps_e: Floats  # (n, 3)
+    A: Floats  # (n, 3, 3)
+    z1: Floats  # (n, 4)
+    z2: Floats  # (n, 3)
 
     @property
     def norm(self) -> Floats:
@@ -293,7 +207,7 @@ class Coordinates:
 
 
 def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Floats, C1: Floats) -> Coordinates:
-    """z₁, z₂ and their parts; arguments as in `Samples`, C1 the gain's diagonal. Shape (3,)."""
+    """z₁, z₂ and their parts; arguments as in `Samples`, C1 the gain's diagonal, (3,) or (n, 3)."""
     s = sign[:, None]
     eta, eps, eta_d, eps_d = q[:, :1], q[:, 1:], q_d[:, :1], q_d[:, 1:]
     eta_e = eta_d * eta + (eps_d * eps).sum(axis=1, keepdims=True)  # (C.16), (C.32)
@@ -314,7 +228,6 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
     b = coordinates(q, x.omega, x.q_d, x.omega_d, x.sign, C1)
     Q = coordinates(x.q_Q, x.omega_Q, x.q_d, x.omega_d, x.sign, C1)
     z = b.norm
-    one = np.ones_like(z)
 
     def Psi(omega: Floats, R: Floats) -> Floats:  # noqa: N802  # the paper's letter
         Psi: Floats = -np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g))  # (C.43), (C.45)
@@ -324,40 +237,25 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
         alpha_dot: Floats = -x.sign[:, None] / 2 * C1 * times(c.A, c.omega_e)  # (C.46); of the true state it is α̇
         return alpha_dot
 
-    Psi_error = Psi(x.omega, b.R) - Psi(x.omega_Q, Q.R)
     S_error = skew(x.omega) @ b.R - skew(x.omega_Q) @ Q.R
+    sides: dict[str, tuple[str, Floats, Any]] = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
+        "C.28": ("‖ε^Q − ε‖", (x.q_Q - q)[:, 1:], p.delta_eps),
+        "C.29": ("‖ω^Q − ω‖", x.omega_Q - x.omega, p.delta_omega),
+        "C.26": ("‖ω_e‖", b.omega_e, d.k_omega_e * z),
+        "C.27": ("‖ω‖", x.omega, d.k_omega_e * z + p.k_omega_d),  # (C.27)
+        "C.50": ("‖ω_e^Q − ω_e‖", Q.omega_e - b.omega_e, d.delta_omega_e),  # (C.50)
+        "C.51": ("‖z₂^Q − z₂‖", Q.z2 - b.z2, d.delta_z2),  # (C.51)
+        "C.52": ("‖G z₁ − G^Q z₁^Q‖", b.eps_e - Q.eps_e, d.delta_z1),  # (C.52)
+        "C.53": ("‖R_i^Q − R_i^b‖", Q.R - b.R, d.delta_R),  # (C.53)
+        "C.54": ("‖Ψ − Ψ^Q‖", Psi(x.omega, b.R) - Psi(x.omega_Q, Q.R), d.delta_Psi1 + d.delta_Psi2 * z),  # (C.54)
+        "C.55": ("‖S(ω)R_i^b − S(ω^Q)R_i^Q‖", S_error, d.delta_S1 + d.delta_S2 * z),  # (C.55)
+        "C.56": ("‖ᾱ^Q − α̇‖", alpha_bar(Q) - alpha_bar(b), d.delta_alpha1 + d.delta_alpha2 * z),  # (C.56)
+        "C.57": ("‖Φ − Φ^Q‖", np.abs(x.omega_Q - x.omega).max(axis=1, keepdims=True), d.delta_Phi),  # (C.57)
+    }
     return [
-        Inequality("C.28", "‖ε^Q − ε‖", norm((x.q_Q - q)[:, 1:]), p.delta_eps * one),  # (C.28)
-        Inequality("C.29", "‖ω^Q − ω‖", norm(x.omega_Q - x.omega), p.delta_omega * one),  # (C.29)
-        Inequality("C.26", "‖ω_e‖", norm(b.omega_e), d.k_omega_e * z),  # (C.26)
-        Inequality("C.27", "‖ω‖", norm(x.omega), d.k_omega_e * z + p.k_omega_d),  # (C.27)
-        Inequality("C.50", "‖ω_e^Q − ω_e‖", norm(Q.omega_e - b.omega_e), d.delta_omega_e * one),  # (C.50)
-        Inequality("C.51", "‖z₂^Q − z₂‖", norm(Q.z2 - b.z2), d.delta_z2 * one),  # (C.51)
-        Inequality("C.52", "‖G z₁ − G^Q z₁^Q‖", norm(b.eps_e - Q.eps_e), d.delta_z1 * one),  # (C.52)
-        Inequality("C.53", "‖R_i^Q − R_i^b‖", norm(Q.R - b.R), d.delta_R * one),  # (C.53)
-        Inequality("C.54", "‖Ψ − Ψ^Q‖", norm(Psi_error), d.delta_Psi1 + d.delta_Psi2 * z),  # (C.54)
-        Inequality("C.55", "‖S(ω)R_i^b − S(ω^Q)R_i^Q‖", norm(S_error), d.delta_S1 + d.delta_S2 * z),  # (C.55)
-        Inequality(
-            "C.56", "‖ᾱ^Q − α̇‖", norm(alpha_bar(Q) - alpha_bar(b)), d.delta_alpha1 + d.delta_alpha2 * z
-        ),  # (C.56)
-        Inequality("C.57", "‖Φ − Φ^Q‖", np.abs(x.omega_Q - x.omega).max(axis=1), d.delta_Phi * one),  # (C.57)
+        Inequality(number, what, norm(error), np.broadcast_to(right, z.shape))
+        for number, (what, error, right) in sides.items()
     ]
-
-
-def lyapunov(c: Coordinates, theta_error: Floats, law: AdaptiveSettings) -> Floats:
-    """V of the true state.
-
-    Args:
-        c: The error coordinates.
-        theta_error: θ̃ = θ − θ̂ [N·m·s/rad]. Shape (n, 3).
-        law: The model and the gains.
-
-    Returns:
-        V, with z₁ weighed by an implied 1 N·m [N·m]. Shape (n,).
-    """
-    J, Gamma = np.array(law.inertia), np.array(law.Gamma)
-    V: Floats = (c.z1**2).sum(axis=1) + (c.z2**2 @ J + theta_error**2 @ (1 / Gamma)) / 2  # (C.24), (C.73)
-    return V
 
 
 def skew(v: Floats) -> Floats:

@@ -1,10 +1,9 @@
 """Certificate: what is proven of a configuration, with its assumptions, and what fails.
 
-A user's law may bring its own, `Law.certify`. Of every law that `feedback` knows: a bound of the error at every
-instant, by `invariant`, for the paper's body and for the configured plant. The certificate holds if the plant's set is
-proven and lies within all that the proof presumes: the wire's ranges, the voltages within reach, half a turn, the bound
-of the damping. Of the paper's law also condition (C.66) with its terms, by `bounds`: a law in continuous time, so
-nothing of a sampled loop is concluded from it.
+Of every law that `feedback` knows: a bound of the error at every instant, by `invariant`, for the paper's body and for
+the configured plant. The certificate holds if the plant's set is proven and lies within all that the proof presumes:
+the wire's ranges, the voltages within reach, half a turn, the bound of the damping. Of the paper's law also condition
+(C.66) with its terms, by `bounds`: a law in continuous time, so nothing of a sampled loop is concluded from it.
 """
 
 from __future__ import annotations
@@ -21,17 +20,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aeroloop.protocol.messages.operator import Change, Hold, in_force
 from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
-from aeroloop.service.control.laws.registry import law_class, words_of
 from aeroloop.service.control.motion import START_WITHIN_DEG
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.extremes import BoundlessError, Extremes, chords, extremes, motors
 from aeroloop.service.theorem.feedback import NoTheoremError, feedback_of
 from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
-from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
+from aeroloop.service.theorem.plant_bounds import NO_ENCODER, PlantBounds, paper_body, plant_bounds
 
 MOST_DELAY_S: Final = 1.0
 RESOLUTION_S: Final = 1e-5
@@ -97,15 +94,6 @@ class Certificate(BaseModel):
         return {term.symbol: term.value for term in self.terms}[symbol]
 
 
-class CustomCertificate(BaseModel):
-    """What a user's law says is proven of a configuration: `Law.certify`. It may have more than these."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    holds: bool
-    verdict: str
-
-
 class Paper(NamedTuple):
     """What the paper says of its law: inputs, Lemma 1, Theorem 1."""
 
@@ -116,33 +104,17 @@ class Paper(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The quantities of a certificate, to check a run against.
+    """The quantities of a certificate, to check a run against; None where nothing is proven."""
 
-    Attributes:
-        desired: The reference's extremes.
-        paper: What the paper says of its law; None of another.
-        body: Premises of the paper's body.
-        plant: Premises of the configured plant.
-        body_reach: What the paper's body reaches; None where nothing is proven.
-        plant_reach: What the configured plant reaches; likewise.
-        bounds: What the plant does beyond the paper's equations.
-    """
-
-    desired: Extremes
-    paper: Paper | None
-    body: Premises
-    plant: Premises
+    paper: Paper | None  # what the paper says of its law; None of another
+    body: Premises  # of the paper's body
+    plant: Premises  # of the configured plant
     body_reach: Reach | None
     plant_reach: Reach | None
-    bounds: PlantBounds
 
 
 def evaluate(
-    settings: Settings,
-    *,
-    disturbance: float | None = None,
-    attitude_error_deg: float | None = None,
-    late_s: float = 0.0,
+    settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0, start_deg: float = START_WITHIN_DEG
 ) -> Evaluated:
     """The quantities of a certificate; arguments and errors as of `certify`.
 
@@ -161,55 +133,36 @@ def evaluate(
     body_reach, plant_reach = reach(body), reach(plant)
     paper = None
     if isinstance(settings.law, AdaptiveSettings):
-        start_deg = START_WITHIN_DEG if attitude_error_deg is None else attitude_error_deg
-        angles = [radians(min(180.0, start_deg)), *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at)]
-        known = _known(settings, settings.law, desired, body, max(angles))
+        start = radians(min(180.0, start_deg))
+        error = max(start, *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at), 0.0)
+        known = _known(settings, settings.law, body, error)
         lemma = lemma_1(known)
         paper = Paper(known, lemma, theorem_1(known, lemma))
-    return Evaluated(desired, paper, body, plant, body_reach, plant_reach, bounds)
+    return Evaluated(paper, body, plant, body_reach, plant_reach)
 
 
 def premises(
     settings: Settings, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
 ) -> Premises:
-    """Premises of the invariant set.
-
-    Args:
-        settings: The configuration.
-        desired: The reference's extremes.
-        plant: What the plant does beyond the paper's equations.
-        disturbance: Further torque [N·m].
-        late_s: Further age of a command [s].
-    """
+    """Premises of the invariant set, with a further torque [N·m] and a further age of every command [s]."""
     wire, law = settings.wire, settings.law
     gravity = law.mass * law.gravity
     return Premises(
         law=feedback_of(law),
+        desired=desired,
+        plant=replace(plant, age=plant.age + late_s, torque=plant.torque + disturbance),
         J=law.inertia,
         weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
         weight_roll=abs(law.centre_of_mass[1]) * gravity,
         norm_B=float(np.linalg.norm(motors(settings), 2)),
         delta_omega=_error(wire.rate, 3) + plant.delta_omega,
         delta_u=_error(wire.voltage, wire.actuators),
-        k_omega_d=desired.rate,
-        k_omega_d_dot=desired.acceleration,
-        k_omega_d_ddot=desired.jerk,
-        axis_rate=desired.axis_rate,
-        half_angle_d=desired.half_angle,
         delta_q=chords(desired, _error(wire.attitude, 1) + plant.delta_eps),
         period=settings.loop.period,
-        age=plant.age + late_s,
-        k_tau_d=plant.torque + disturbance,
-        steady=plant.steady,
-        tilt=desired.tilt if plant.held_roll else None,
-        lag=plant.lag,
-        uneven=plant.uneven,
-        encoder=plant.encoder,
     )
 
 
-def _known(settings: Settings, law: AdaptiveSettings, desired: Extremes, body: Premises, error: float) -> Known:
-    wire = settings.wire
+def _known(settings: Settings, law: AdaptiveSettings, body: Premises, error: float) -> Known:
     return Known(
         lambda_J=max(law.inertia),
         weight=body.weight,
@@ -218,18 +171,16 @@ def _known(settings: Settings, law: AdaptiveSettings, desired: Extremes, body: P
         C1_max=max(law.C1),
         C2_min=min(law.C2),
         C2_max=max(law.C2),
-        delta_eps=_error(wire.attitude, 3),
-        delta_omega=_error(wire.rate, 3),
+        delta_eps=_error(settings.wire.attitude, 3),
+        delta_omega=_error(settings.wire.rate, 3),
         delta_u=body.delta_u,
-        k_omega_d=desired.rate,
-        k_omega_d_dot=desired.acceleration,
-        half_angle_d=desired.half_angle,
+        k_omega_d=body.desired.rate,
+        k_omega_d_dot=body.desired.acceleration,
+        half_angle_d=body.desired.half_angle,
         half_angle_e=error / 2,
         k_theta=hypot(*law.damping_estimate) + law.damping_bound,
         k_theta_err=body.law.theta_error,
-        k_tau_d=body.k_tau_d,
-        omega_limit=wire.rate.limit,
-        u_limit=wire.voltage.limit,
+        k_tau_d=body.plant.torque,
     )
 
 
@@ -243,8 +194,8 @@ def certify(
     settings: Settings,
     *,
     disturbance: float | None = None,
-    attitude_error_deg: float | None = None,
     late_s: float = 0.0,
+    start_deg: float = START_WITHIN_DEG,
     margins: bool = True,
 ) -> Certificate:
     """The certificate of a configuration.
@@ -252,8 +203,8 @@ def certify(
     Args:
         settings: The configuration.
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
-        attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; 20° if None, within which sessions begin.
         late_s: Further age of a command, by delay, or by lost frames where the law has no integral [s].
+        start_deg: Assumed bound of the attitude error, for Lemma 1 [deg].
         margins: Search delay_ms and lost_frames, too.
 
     Raises:
@@ -261,56 +212,30 @@ def certify(
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    e = evaluate(settings, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
+    e = evaluate(settings, disturbance=disturbance, late_s=late_s, start_deg=start_deg)
     violated = _violated(settings, e, e.plant, e.plant_reach)
     delay = _largest_delay(settings, e) if margins and not violated else None
-    law = e.plant.law
-    constant = (
-        reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else e.plant_reach
-    )
+    law, at = e.plant.law, e.plant_reach
+    constant = reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else at
     return Certificate(
         holds=not violated,
-        pointwise_radius=_radius(e.body_reach),
-        pointwise_deg=_degrees(e.body_reach),
-        plant_radius=_radius(e.plant_reach),
-        plant_deg=_degrees(e.plant_reach),
-        constant_radius=_radius(constant),
+        pointwise_radius=None if e.body_reach is None else e.body_reach.radius,
+        pointwise_deg=None if e.body_reach is None else degrees(2 * asin(e.body_reach.eps_e)),
+        plant_radius=None if at is None else at.radius,
+        plant_deg=None if at is None else degrees(2 * asin(at.eps_e)),
+        constant_radius=None if constant is None else constant.radius,
         delay_ms=None if delay is None else floor(delay * 1e5) / 100,
         lost_frames=None if delay is None or any(law.ki) else floor(delay / settings.loop.period),
-        assumptions=_assumptions(settings, e, disturbance),
+        assumptions=list(_assumptions(settings, e, disturbance)),
         violated=violated,
-        terms=[*(term for part in e.paper or () for term in _terms(part)), *_reach_terms(e.plant_reach)],
+        terms=list(_terms(e)),
     )
-
-
-def certificate_of(settings: Settings, **options: Any) -> Certificate | CustomCertificate:
-    """The certificate of a configuration, whatever its law.
-
-    Args:
-        settings: The configuration.
-        options: As `certify` takes them, for the paper's law.
-
-    Raises:
-        NoTheoremError: The law has none, or its own `certify` fails; one line that names it.
-        BoundlessError: The reference has no bounds.
-        PluginError: There is no such law.
-    """
-    law, kind = law_class(settings.law), settings.law.kind
-    try:
-        own = law.certify(settings)
-        if own is not None:
-            return CustomCertificate.model_validate(own)
-    except ValidationError as error:
-        raise NoTheoremError(f"the certificate of law {kind} is none: {problem(error, CustomCertificate)}") from None
-    except Exception as error:
-        raise NoTheoremError(f"no certificate: {words_of(kind, error, law.certify)}") from None
-    return certify(settings, **options)
 
 
 def described_certificate(settings: Settings) -> dict[str, Any] | None:
     """The certificate as a controller's description carries it; None of a stream, or of a law without a theorem."""
     try:
-        return certificate_of(settings).model_dump(mode="json")
+        return certify(settings).model_dump(mode="json")
     except (NoTheoremError, BoundlessError):
         return None
 
@@ -341,8 +266,7 @@ def promise(settings: Settings, changes: Sequence[Change] = (), described: Mappi
     try:
         bounds = evaluate(begun)
     except NoTheoremError as error:
-        text = str(error)
-        return Promise(law, None, None, (described or {}).get("verdict", f"{text[0].upper()}{text[1:]}."))
+        return Promise(law, None, None, f"{str(error)[:1].upper()}{str(error)[1:]}.")
     except BoundlessError as error:
         return Promise(law, None, None, f"Nothing is promised: {error}.")
     certificate = None
@@ -361,7 +285,7 @@ def _largest_delay(settings: Settings, e: Evaluated) -> float:
     """
 
     def holds(delay: float) -> bool:
-        later = replace(e.plant, age=e.plant.age + delay)
+        later = replace(e.plant, plant=replace(e.plant.plant, age=e.plant.plant.age + delay))
         return not _violated(settings, e, later, reach(later))
 
     low, high = 0.0, MOST_DELAY_S
@@ -375,33 +299,30 @@ def _largest_delay(settings: Settings, e: Evaluated) -> float:
 
 def _violated(settings: Settings, e: Evaluated, p: Premises, at: Reach | None) -> list[str]:
     """What fails, the gravest first."""
-    found = list(e.bounds.unproven)
-    if e.bounds.theta is not None:
-        away = hypot(*(a - b for a, b in zip(e.bounds.theta, p.law.centre, strict=True)))
+    found = list(p.plant.unproven)
+    if p.plant.theta is not None:
+        away = hypot(*(a - b for a, b in zip(p.plant.theta, p.law.centre, strict=True)))
         if away > p.law.radius:
             found.append(
                 f"the plant's damping is {away:.3g} N·m·s/rad from law.damping_estimate, and law.damping_bound = "
                 f"{p.law.radius:g}"
             )
     where = "the set" if at else "what the quantizers alone do along the reference"
-    for symbol, value, unit, most, name in beyond(settings, e.desired, p, at or without_error(p)):
-        found.append(
-            f"{name} = {most:g} {unit}".rstrip()
-            + f", and {symbol} may reach {value:.3g} {unit}".rstrip()
-            + f" by {where}"
-        )
-    return found if at else [*found, _unproven(p, e.body, e.bounds)]
+    for symbol, value, unit, most, name in beyond(settings, p, at or without_error(p)):
+        allowed, reached = f"{name} = {most:g} {unit}".rstrip(), f"{value:.3g} {unit}".rstrip()
+        found.append(f"{allowed}, and {symbol} may reach {reached} by {where}")
+    return found if at else [*found, _unproven(p, e.body)]
 
 
-def beyond(settings: Settings, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
+def beyond(settings: Settings, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
     """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
     wire = settings.wire
     limit = min(wire.voltage.limit, settings.plant.voltage_limit, p.law.volts)
-    rate = at.axis_rate + p.delta_omega + p.encoder.ripple
+    rate = at.axis_rate + p.delta_omega + p.plant.encoder.ripple
     ranges = (
         ("|ω_k|", rate, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
         ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
-        ("|u_k|", largest_voltage(settings, desired, at), "V", limit, "saturation: wire.voltage.limit"),
+        ("|u_k|", largest_voltage(settings, p.desired, at), "V", limit, "saturation: wire.voltage.limit"),
         ("|θ̂_d|", at.integral, "N·m", p.law.torque, "law.torque_bound"),
     )
     return [each for each in ranges if each[1] > each[3]]
@@ -413,22 +334,24 @@ def largest_voltage(settings: Settings, desired: Extremes, at: Reach) -> float:
     return float((desired.voltages + np.linalg.norm(inverse, axis=1) * at.deviation).max())
 
 
-def _unproven(p: Premises, body: Premises, bounds: PlantBounds) -> str:
+def _unproven(p: Premises, body: Premises) -> str:
     """Which properties of the plant, removed one after the other, leave a set that is proven."""
     no_theta = p.law._replace(radius=0.0, reach=0.0, Gamma=(0.0, 0.0, 0.0))
-    without: tuple[tuple[str, dict[str, Any]], ...] = (
-        (f"rotors that lag by {p.lag:.3g} s", {"lag": 0.0, "uneven": 0.0}),
-        (f"commands {p.age * 1e3:.3g} ms old", {"age": 0.0}),
-        ("the held roll (u₁ is never applied)", {"tilt": None}),
-        ("the rate sensor's errors", {"delta_omega": body.delta_omega, "encoder": body.encoder}),
-        (f"a torque of {p.k_tau_d + p.steady:.2g} N·m", {"k_tau_d": body.k_tau_d, "steady": 0.0}),
-        ("the attitude sensor's error", {"delta_q": body.delta_q} if bounds.delta_eps else {}),
-        (f"‖θ̃‖ up to {p.law.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"law": no_theta}),
-        ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
+    of_plant, body_plant, torque = p.plant, body.plant, p.plant.torque + p.plant.steady
+    of_body: dict[str, Any] = {"delta_q": body.delta_q} if p.plant.delta_eps else {}
+    without: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
+        (f"rotors that lag by {of_plant.lag:.3g} s", {}, {"lag": 0.0, "uneven": 0.0}),
+        (f"commands {of_plant.age * 1e3:.3g} ms old", {}, {"age": 0.0}),
+        ("the held roll (u₁ is never applied)", {}, {"held_roll": False}),
+        ("the rate sensor's errors", {"delta_omega": body.delta_omega}, {"encoder": NO_ENCODER}),
+        (f"a torque of {torque:.2g} N·m", {}, {"torque": body_plant.torque, "steady": 0.0}),
+        ("the attitude sensor's error", of_body, {}),
+        (f"‖θ̃‖ up to {p.law.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"law": no_theta}, {}),
+        ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}, {}),
     )
     names = list[str]()
-    for name, change in without:
-        changed = replace(p, **change)
+    for name, changes, of_it in without:
+        changed = replace(p, plant=replace(p.plant, **of_it), **changes)
         if changed != p:
             p = changed
             names.append(name)
@@ -437,57 +360,38 @@ def _unproven(p: Premises, body: Premises, bounds: PlantBounds) -> str:
     return f"no invariant set is proven with {'; with '.join(names)}"
 
 
-def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) -> list[str]:
+def _assumptions(settings: Settings, e: Evaluated, disturbance: float | None) -> Iterator[str]:
     law = e.plant.law
-    found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
-    paper = (
-        [f"for Lemma 1: the attitude error stays below {degrees(2 * e.paper.known.half_angle_e):g}°"] if e.paper else []
-    )
-    return [
-        f"θ is constant, within {law.radius:g} N·m·s/rad of the first estimate (law.damping_bound)",
-        f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)",
-        *paper,
-        "a state near enough to the set, once, and for the age of a command before",
-        *(
-            ["the integral in balance then, and no measurement lost: without one it does not advance"]
-            if any(law.ki)
-            else []
-        ),
-        "the reference itself is followed: no approach to it is certified, at a start or after an operator's change",
-        "the law's J, B, m and r_g are the plant's ([law])",
-        *(["the attitude that it finds and holds is level (reference.attitude)"] if found else []),
-        *e.bounds.assumed,
-    ]
-
-
-def _terms(part: Known | Lemma | Theorem) -> Iterator[CertificateTerm]:
-    hints: dict[str, Any] = get_type_hints(type(part), include_extras=True)
-    for name, hint in hints.items():
-        term: Term = hint.__metadata__[0]
-        yield CertificateTerm(value=getattr(part, name), **term._asdict())
+    yield f"θ is constant, within {law.radius:g} N·m·s/rad of the first estimate (law.damping_bound)"
+    yield f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)"
+    if e.paper:
+        error = degrees(2 * e.paper.known.half_angle_e)
+        yield f"for Lemma 1: the attitude error stays below {error:g}°"
+    yield "a state near enough to the set, once, and for the age of a command before"
+    if any(law.ki):
+        yield "the integral in balance then, and no measurement lost: without one it does not advance"
+    yield "the reference itself is followed: no approach to it is certified, at a start or after an operator's change"
+    yield "the law's J, B, m and r_g are the plant's ([law])"
+    if isinstance(settings.reference, Hold) and settings.reference.attitude is None:
+        yield "the attitude that it finds and holds is level (reference.attitude)"
+    yield from e.plant.plant.assumed
 
 
 _REACH: Final = {
-    "eps_e": ("max ‖ε̃‖", "1", "attitude error within the configured plant's set"),
-    "omega_e": ("max ‖ω_e‖", "rad/s", "rate error within it"),
-    "axis_rate": ("max |ω_k| reached", "rad/s", "rate about an axis within it"),
-    "slow": ("‖w_s‖", "N·m", "slow torque: θ̃ along the reference, steady wind"),
-    "fast": ("‖w_f‖", "N·m", "fast torque: friction and gusts; θ̃ on the error's rate"),
-    "noise": ("‖w_q‖", "N·m", "error of the command by quantizers and sensors"),
-    "hold": ("τ_h of the plant", "N·m", "torque by which commands are out of date"),
-    "deviation": ("max ‖B u − B u_d‖", "N·m", "command beyond that of the reference"),
+    "axis_rate": Term("max |ω_k| reached", "invariant set", "rad/s", "rate about an axis within it"),
+    "slow": Term("‖w_s‖", "invariant set", "N·m", "slow torque: θ̃ along the reference, steady wind"),
+    "fast": Term("‖w_f‖", "invariant set", "N·m", "fast torque: friction and gusts; θ̃ on the error's rate"),
+    "noise": Term("‖w_q‖", "invariant set", "N·m", "error of the command by quantizers and sensors"),
+    "hold": Term("τ_h of the plant", "invariant set", "N·m", "torque by which commands are out of date"),
 }
 
 
-def _reach_terms(at: Reach | None) -> Iterator[CertificateTerm]:
-    for name, (symbol, unit, meaning) in _REACH.items():
-        value = None if at is None else getattr(at, name)
-        yield CertificateTerm(symbol=symbol, equation="invariant set", value=value, unit=unit, meaning=meaning)
-
-
-def _radius(at: Reach | None) -> float | None:
-    return None if at is None else at.radius
-
-
-def _degrees(at: Reach | None) -> float | None:
-    return None if at is None else degrees(2 * asin(at.eps_e))
+def _terms(e: Evaluated) -> Iterator[CertificateTerm]:
+    """What the paper says of its law, then what the configured plant's set is made of."""
+    for part in e.paper or ():
+        hints: dict[str, Any] = get_type_hints(type(part), include_extras=True)
+        for name, hint in hints.items():
+            yield CertificateTerm(value=getattr(part, name), **hint.__metadata__[0]._asdict())
+    for name, term in _REACH.items():
+        value = None if e.plant_reach is None else getattr(e.plant_reach, name)
+        yield CertificateTerm(value=value, **term._asdict())

@@ -32,37 +32,23 @@ class BoundlessError(AeroloopError):
 
 
 class Extremes(NamedTuple):
-    """Bounds that a reference never exceeds.
+    """Bounds that a reference never exceeds."""
 
-    Attributes:
-        rate: k_ω_d, largest ‖ω_d‖ [rad/s].
-        acceleration: k_ω̇_d, largest ‖ω̇_d‖ [rad/s²].
-        jerk: largest ‖ω̈_d‖ [rad/s³].
-        axis_rate: Largest element of ω_d in the desired body frame [rad/s].
-        half_angle: Half the largest angle of q_d from [1, 0], at most π/2 [rad].
-        tilt: Largest pitch, at most π/2 [rad].
-        eps: w and the largest Σ|ε_d,k| + w ‖ε_d‖, for some w: both are large together at few attitudes [1].
-        voltages: Largest |u_k| of each motor present that the law commands without error and with θ̂ = 0 [V].
-        rolls: Whether its roll is ever anything but 0.
-    """
-
-    rate: float
-    acceleration: float
-    jerk: float
-    axis_rate: float
-    half_angle: float
-    tilt: float
-    eps: tuple[tuple[float, float], ...]
-    voltages: tuple[float, ...]
-    rolls: bool
+    rate: float  # k_ω_d, largest ‖ω_d‖ [rad/s]
+    acceleration: float  # k_ω̇_d, largest ‖ω̇_d‖ [rad/s²]
+    jerk: float  # largest ‖ω̈_d‖ [rad/s³]
+    axis_rate: float  # largest element of ω_d in the desired body frame [rad/s]
+    half_angle: float  # half the largest angle of q_d from [1, 0], at most π/2 [rad]
+    tilt: float  # largest pitch, at most π/2 [rad]
+    eps: tuple[tuple[float, float], ...]  # w and the largest Σ|ε_d,k| + w ‖ε_d‖: both are large at few attitudes [1]
+    voltages: tuple[float, ...]  # largest |u_k| of each motor present, without error and with θ̂ = 0 [V]
+    rolls: bool  # whether its roll is ever anything but 0
 
 
 def extremes(settings: Settings) -> Extremes:
     """The extremes of a configuration's reference from its first tick on, for the body that its law assumes.
 
-    Raises:
-        BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
-        ValueError: B cannot be inverted.
+    Raises BoundlessError for a stream and for a reference too fast for floats, ValueError if B cannot be inverted.
     """
     law, inverse = settings.law, np.linalg.inv(motors(settings))
     if isinstance(settings.reference, Stream):
@@ -81,16 +67,18 @@ def extremes(settings: Settings) -> Extremes:
             )
 
         def weighed(w: float) -> float:
-            return trajectory.largest(lambda at: _weighed(at, w), half * [sqrt(3) + w, 1, 1, 1])
+            def of(at: Angles) -> Floats:
+                return np.asarray(np.abs(eps := vectors(at)).sum(axis=1) + w * np.linalg.norm(eps, axis=1))
 
+            return trajectory.largest(of, half * [sqrt(3) + w, 1, 1, 1])
+
+        largest_sine = trajectory.largest(lambda at: np.sin(half_angles(at)), half)
         found = Extremes(
             rate=slack * trajectory.fastest(),
             acceleration=slack * trajectory.largest(lambda at: np.linalg.norm(body_rates(at)[1], axis=1), changes),
             jerk=slack * jerk_bound(rate, acceleration, jerk),
             axis_rate=slack * trajectory.largest(lambda at: np.abs(body_rates(at)[0]).max(axis=1), rates),
-            half_angle=min(
-                pi / 2, slack * asin(min(1.0, trajectory.largest(lambda at: np.sin(half_angles(at)), half)))
-            ),
+            half_angle=min(pi / 2, slack * asin(min(1.0, largest_sine))),
             tilt=min(pi / 2, slack * float(angle[1])),
             eps=tuple((w, slack * weighed(w)) for w in _WEIGHTS),
             voltages=tuple(slack * voltage(row) for row in inverse),
@@ -196,12 +184,6 @@ def chords(desired: Extremes, delta: float) -> Callable[[float], float]:
         return delta * sqrt(3 + float(slope.max()) ** 2)
 
     return chord
-
-
-def _weighed(angles: Angles, w: float) -> Floats:
-    eps = vectors(angles)
-    weighed: Floats = np.abs(eps).sum(axis=1) + w * np.linalg.norm(eps, axis=1)
-    return weighed
 
 
 def vectors(angles: Angles) -> Floats:

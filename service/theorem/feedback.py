@@ -1,17 +1,7 @@
-"""Feedback: a law near its reference, as the error equations of `invariant` see it.
+"""Feedback: a law near its reference, as the error equations of `invariant` see it: (T.1) of README.md.
 
-Near the equilibrium e = [1, 0], with the true state, every law here commands, beyond what the model needs to follow the
-reference,
-
-    diag(ω) θ̂  −  k_p ε̃  −  (k_d + α) ω_e  −  α ((η̃ − 1) I + S(ε̃)) ω_e  −  k_i ∫(ω_e + c ε̃)
-
-- the paper's law (C.22): z₂ = ω_e + C₁ε̃ and ᾱ = −½ C₁ (η̃ I + S(ε̃)) ω_e make k_p = I + C₁C₂, k_d = C₂, α = ½ J C₁;
-- without adaptation θ̂ stays at its first value, the centre of the ball that holds θ;
-- PD and PID: their own gains, α = 0;
-- `adaptive-torque`: k_p = k₁ + C₁C₂, k_i = Γ_d, and the rest as the paper's law; what it makes of Coulomb friction
-  counts as a disturbance.
-
-c of a law without an integral is C₁, or 0: the share of ε̃ in z₂.
+c of a law without an integral is C₁, or 0: the share of ε̃ in z₂. What `adaptive-torque` makes of Coulomb friction is
+a disturbance.
 """
 
 from __future__ import annotations
@@ -35,37 +25,21 @@ class NoTheoremError(AeroloopError):
 
 
 class Feedback(NamedTuple):
-    """A law near its reference; vectors are diagonals.
+    """A law near its reference; vectors are diagonals."""
 
-    Attributes:
-        kp: Gain of ε̃ [N·m].
-        kd: Gain of ω_e, without α [N·m·s/rad].
-        alpha: α, part of the gain of ω_e that acts through (η̃ I + S(ε̃)) [N·m·s/rad].
-        ki: Gain of the integral [N·m/rad]; 0 where there is none.
-        share: c, of ε̃ in z₂ = ω_e + c ε̃ and in the integral [1/s].
-        centre: θ̂(t₀), the centre of the ball that holds θ [N·m·s/rad].
-        radius: k_θ, the radius of that ball [N·m·s/rad].
-        reach: Largest ‖θ̂ − θ̂(t₀)‖: k_θ/0.95 by the projection, 0 where nothing adapts [N·m·s/rad].
-        Gamma: Adaptation gain; 0 where nothing adapts.
-        volts: |u| from which the law itself saturates [V].
-        torque: |θ̂_d| from which the estimate of a constant torque is kept back [N·m].
-        coulomb: Largest ‖θ̂_c‖, an estimate of Coulomb friction, which counts as a disturbance [N·m].
-        virtual: Whether θ̂ − θ̂(t₀) acts at the virtual rate ω − z₂ in place of ω.
-    """
-
-    kp: Vector
-    kd: Vector
-    alpha: Vector
-    ki: Vector
-    share: Vector
-    centre: Vector
-    radius: float
-    reach: float
-    Gamma: Vector
-    volts: float = inf
-    torque: float = inf
-    coulomb: float = 0.0
-    virtual: bool = False
+    kp: Vector  # gain of ε̃ [N·m]
+    kd: Vector  # gain of ω_e, without α [N·m·s/rad]
+    alpha: Vector  # α, part of the gain of ω_e that acts through (η̃ I + S(ε̃)) [N·m·s/rad]
+    ki: Vector  # gain of the integral [N·m/rad]; 0 where there is none
+    share: Vector  # c, of ε̃ in z₂ = ω_e + c ε̃ and in the integral [1/s]
+    centre: Vector  # θ̂(t₀), the centre of the ball that holds θ [N·m·s/rad]
+    radius: float  # k_θ, the radius of that ball [N·m·s/rad]
+    reach: float = 0.0  # largest ‖θ̂ − θ̂(t₀)‖: k_θ/0.95 by the projection, 0 where nothing adapts [N·m·s/rad]
+    Gamma: Vector = _NONE  # adaptation gain; 0 where nothing adapts
+    volts: float = inf  # |u| from which the law itself saturates [V]
+    torque: float = inf  # |θ̂_d| from which the estimate of a constant torque is kept back [N·m]
+    coulomb: float = 0.0  # largest ‖θ̂_c‖, an estimate of Coulomb friction, which counts as a disturbance [N·m]
+    virtual: bool = False  # whether θ̂ − θ̂(t₀) acts at the virtual rate ω − z₂ in place of ω
 
     @property
     def theta_error(self) -> float:
@@ -85,7 +59,6 @@ def feedback_of(law: LawSettings) -> Feedback:
         raise NoTheoremError("no theorem for this vehicle, whose law.allocation is not 3 × 3")
     match law:
         case AdaptiveSettings() | NonadaptiveSettings():
-            adapts = isinstance(law, AdaptiveSettings)
             return Feedback(
                 kp=_each(lambda c1, c2: 1 + c1 * c2, law.C1, law.C2),
                 kd=law.C2,
@@ -94,7 +67,7 @@ def feedback_of(law: LawSettings) -> Feedback:
                 share=law.C1,
                 centre=law.damping_estimate,
                 radius=law.damping_bound,
-                reach=law.damping_bound * ESTIMATE_REACH if adapts else 0.0,
+                reach=law.damping_bound * ESTIMATE_REACH if isinstance(law, AdaptiveSettings) else 0.0,
                 Gamma=law.Gamma if isinstance(law, AdaptiveSettings) else _NONE,
             )
         case PDSettings() | PIDSettings():
@@ -107,11 +80,13 @@ def feedback_of(law: LawSettings) -> Feedback:
                 share=pid.attitude_share if pid else _NONE,
                 centre=law.damping_estimate,
                 radius=law.damping_bound,
-                reach=0.0,
-                Gamma=_NONE,
                 volts=pid.voltage_limit if pid else inf,
             )
         case AdaptiveTorqueSettings():
+
+            def bounded(first: float, gain: float) -> float:
+                return first + law.coulomb_bound * (gain > 0)
+
             return Feedback(
                 kp=_each(lambda k, c: k + c, law.k1, _each(lambda c1, c2: c1 * c2, law.C1, law.C2)),
                 kd=law.C2,
@@ -124,12 +99,7 @@ def feedback_of(law: LawSettings) -> Feedback:
                 Gamma=law.Gamma_damping,
                 volts=law.voltage_limit,
                 torque=min(law.torque_bound),
-                coulomb=hypot(
-                    *(
-                        first + law.coulomb_bound * (gain > 0)
-                        for first, gain in zip(law.coulomb_estimate, law.Gamma_coulomb, strict=True)
-                    )
-                ),
+                coulomb=hypot(*_each(bounded, law.coulomb_estimate, law.Gamma_coulomb)),
                 virtual=True,
             )
     raise NoTheoremError(f"no theorem for this law, {law.kind}")

@@ -1,15 +1,10 @@
-"""Gains of the linear error equations, from a start and from bounded disturbances, by variation of constants.
+"""Gains of the linear error equations (T.2) of README.md, from a start and from bounded disturbances.
 
-The states of an axis are ε̃ and ω_e, the integral i where the law has one, and the torque y of the feedback where rotors
-lag behind it, with φ the share of the feedback's torque that acts:
+The states of an axis are ε̃ and ω_e, the integral where the law has one, filtered rate and its slope where encoders give
+it, and the torque of the feedback where rotors lag behind it. For each output h, over all axes, with the worst axis at
+every s and with ‖x(t₀)‖ the norm of (ε̃, z₂) there,
 
-    ε̃' = ½ ω_e + d₁                          i' = ω_e + c ε̃ + d₄
-    J ω_e' = φ y − c ω_e − 2α d₁ + d₂        T y' = f − y + d₅,      f = −k_p ε̃ − (k_d + α − c) ω_e − k_i i
-
-without rotors y = f. A slow torque w_s beside d₂ is balanced at x = K w_s; about that point d₃ = w_s' acts instead.
-For each output h, over all axes, with the worst axis at every s and with ‖x(t₀)‖ the norm of (ε̃, z₂) there,
-
-    ‖h x(t)‖ ≤ ‖x(t₀)‖ sup ‖h e^{As} M‖ + Σ D_j ∫ ‖h e^{As} E_j‖ ds
+    ‖h x(t)‖ ≤ ‖x(t₀)‖ sup ‖h e^{As} M‖ + Σ D_j ∫ ‖h e^{As} E_j‖ ds                                         (T.3)
 """
 
 from __future__ import annotations
@@ -40,7 +35,7 @@ OUTPUTS: Final = {
 
 
 class Axis(NamedTuple):
-    """One axis; see the module's text. `lag` is T, 0 without rotors."""
+    """One axis, by the letters of (T.2); `lag` is T, 0 without rotors."""
 
     kp: float
     kd: float
@@ -77,12 +72,11 @@ class Gain(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """Gains of every output, and ‖·‖ of w_s for ε̃, (ε̃, z₂) and f at which it is balanced."""
+    """Gains of every output, and ‖·‖ of w_s for ε̃ and (ε̃, z₂) at which it is balanced."""
 
     gains: dict[str, Gain]
     eps: float
     z: float
-    feedback: float
 
 
 def system(axis: Axis) -> System:
@@ -155,10 +149,8 @@ def responses(axes: tuple[Axis, ...]) -> Responses | None:
         else:
             plain = _gain([row @ flow for row, flow in zip(rows, flows, strict=True)], systems, s)
             gains[name] = Gain(plain.start, (*plain.forced, rates.forced[4], 0.0))
-    eps, z, feedback = (
-        max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z", "feedback")
-    )
-    return Responses(gains, eps, z, feedback)
+    eps, z = (max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z"))
+    return Responses(gains, eps, z)
 
 
 def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Gain:

@@ -26,23 +26,14 @@ DEVIATIONS: Final = 6
 
 
 class EncoderRate(NamedTuple):
-    """Errors of a rate that is the filtered derivative of encoders' angles; 0 of any other sensor.
+    """Errors of a rate that is the filtered derivative of encoders' angles; 0 of any other sensor."""
 
-    Attributes:
-        bandwidth: ω_n of the filter [rad/s].
-        ratio: Its ζ [1].
-        lag: Its delay, ∫|1 − step response| [s].
-        ripple: Largest ‖ω‖ by which the encoders' steps make it err [rad/s].
-        angle: The error, as it passes the filter, of the angle whose derivative that is [rad].
-        turn: Error of the pitch by which joint rates become ω [rad].
-    """
-
-    bandwidth: float = 0.0
-    ratio: float = 0.0
-    lag: float = 0.0
-    ripple: float = 0.0
-    angle: float = 0.0
-    turn: float = 0.0
+    bandwidth: float = 0.0  # ω_n of the filter [rad/s]
+    ratio: float = 0.0  # its ζ [1]
+    lag: float = 0.0  # its delay, ∫|1 − step response| [s]
+    ripple: float = 0.0  # largest ‖ω‖ by which the encoders' steps make it err [rad/s]
+    angle: float = 0.0  # the error, as it passes the filter, of the angle whose derivative that is [rad]
+    turn: float = 0.0  # error of the pitch by which joint rates become ω [rad]
 
 
 NO_ENCODER: Final = EncoderRate()
@@ -52,31 +43,20 @@ NO_ENCODER: Final = EncoderRate()
 class PlantBounds:
     """What a plant does beyond the paper's equations. The default is a body of which nothing else is known.
 
-    Attributes:
-        age: Longest time from a measurement to the end of its command, before the rotors' lag [s].
-        lag: Time constant of the rotors, between that of a rise and that of a fall; 0 without [s].
-        uneven: ‖·‖ of the share of what lags by which a rotor that rises or falls errs beside that [1].
-        delta_eps: Largest |ε_k| by which the attitude sensor errs [1].
-        delta_omega: Largest ‖ω‖ by which a gyro errs [rad/s].
-        encoder: Errors of a rate by encoders.
-        torque: Largest torque of friction, dead zone, gusts and motors that differ from the law's [N·m].
-        steady: Largest torque that changes only as the body turns: steady wind, a weight that differs [N·m].
-        theta: θ, if the plant's damping is known [N·m·s/rad].
-        held_roll: Whether a mechanism holds the roll, so that u₁ is never applied.
-        assumed: What is assumed of it, each with its key.
-        unproven: What cannot be bounded, each with its key; no certificate holds with any.
+    `assumed` and `unproven` say with their keys what is assumed, and what cannot be bounded: with any of it no
+    certificate holds.
     """
 
-    age: float
-    lag: float = 0.0
-    uneven: float = 0.0
-    delta_eps: float = 0.0
-    delta_omega: float = 0.0
+    age: float  # longest time from a measurement to the end of its command, before the rotors' lag [s]
+    lag: float = 0.0  # time constant of the rotors, between that of a rise and that of a fall; 0 without [s]
+    uneven: float = 0.0  # ‖·‖ of the share of what lags by which a rotor that rises or falls errs beside that [1]
+    delta_eps: float = 0.0  # largest |ε_k| by which the attitude sensor errs [1]
+    delta_omega: float = 0.0  # largest ‖ω‖ by which a gyro errs [rad/s]
     encoder: EncoderRate = NO_ENCODER
-    torque: float = 0.0
-    steady: float = 0.0
-    theta: Vector | None = None
-    held_roll: bool = False
+    torque: float = 0.0  # largest torque of friction, dead zone, gusts and motors that differ from the law's [N·m]
+    steady: float = 0.0  # largest torque that changes only as the body turns: steady wind, another weight [N·m]
+    theta: Vector | None = None  # θ, if the plant's damping is known [N·m·s/rad]
+    held_roll: bool = False  # whether a mechanism holds the roll, so that u₁ is never applied
     assumed: list[str] = field(default_factory=list)
     unproven: list[str] = field(default_factory=list)
 
@@ -87,12 +67,7 @@ def paper_body(settings: Settings) -> PlantBounds:
 
 
 def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
-    """The configured plant.
-
-    Args:
-        settings: The configuration.
-        stated: Whether a disturbance bound is stated, as a machine needs.
-    """
+    """The configured plant; a machine's needs a `stated` disturbance."""
     plant, law, loop = settings.plant, settings.law, settings.loop
     age = loop.period * (1 if loop.lockstep else 2)
     if not loop.lockstep:
@@ -122,7 +97,6 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
     torque = float(np.linalg.norm(applied - B, 2)) * sqrt(motors) * plant.voltage_limit
     if plant.faults:
         unproven.append("plant.faults are no part of any theorem")
-
     lag, uneven = _rotors(plant.rotor, B)
     if lag:
         assumed.append("the motors were in balance once, and the state within the set ever since (plant.rotor)")
@@ -132,20 +106,18 @@ def plant_bounds(settings: Settings, stated: bool) -> PlantBounds:
         steady += (blows := hypot(*plant.wind.torque))
         torque += blows * DEVIATIONS * plant.wind.gust
         assumed.append(f"gusts stay within {DEVIATIONS} standard deviations (plant.wind.gust)")
-    return _with_sensors(
-        plant.sensors,
-        PlantBounds(
-            age,
-            lag,
-            uneven,
-            torque=torque,
-            steady=steady,
-            theta=_damping(plant),
-            held_roll=held,
-            assumed=assumed,
-            unproven=unproven,
-        ),
+    found = PlantBounds(
+        age,
+        lag=lag,
+        uneven=uneven,
+        torque=torque,
+        steady=steady,
+        theta=_damping(plant),
+        held_roll=held,
+        assumed=assumed,
+        unproven=unproven,
     )
+    return _with_sensors(plant.sensors, found)
 
 
 def _rotors(rotor: RotorSettings, B: Floats) -> tuple[float, float]:
@@ -193,9 +165,8 @@ def _with_sensors(sensors: SensorSettings, plant: PlantBounds) -> PlantBounds:
 def _filter(omega_n: float, zeta: float) -> tuple[float, float, float]:
     """Of ω_n²/(s² + 2ζω_n s + ω_n²), three figures for the errors of a rate.
 
-    Returns:
-        The largest rate of its output for an input that varies by 1 [1/s], its output for an input within ±1 [1], and
-        ∫|1 − step response| [s].
+    They are the largest rate of its output for an input that varies by 1 [1/s], its output for an input within ±1 [1],
+    and ∫|1 − step response| [s].
     """
     t = np.linspace(0, 40 / (zeta * omega_n), 40_000)
     ringing = omega_n * sqrt(1 - zeta**2)

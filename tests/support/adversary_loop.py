@@ -1,14 +1,12 @@
 """A second closed loop in NumPy, of many configurations at once, whose errors an adversary chooses.
 
 It takes numbers from a configuration, and nothing else of the project: body (C.1), (C.2), free or with a held roll; the
-paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag, encoders with their filter, a gyro;
-commands that are held, late or lost.
+paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag; commands that are held, late or lost.
 
-At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the errors of sensors, the direction of τ_d and
-one of the commands that may be in force: each the one that pushes most along a costate of the linear error equations.
-
-Beside these it chooses θ, θ̂(t₀), the instant of the reference's first hundred days at which an experiment ends, and
-where it drives the error: first by what the reference does then, later as children of the worst experiments so far.
+At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the direction of τ_d and one of the commands that
+may be in force: each the one that pushes most along a costate of the linear error equations. Beside these it chooses θ,
+θ̂(t₀), the instant of the reference's first hundred days at which an experiment ends, and where it drives the error:
+first by what the reference does then, later as children of the worst experiments so far.
 
 Every row is an experiment. Constants `c` have shape (rows, 3), (rows, 1) or (rows, 3, 3), vectors (rows, 3), and
 quaternions (rows, 4) with the scalar first; the law also takes an axis of alternatives, (rows, n, 3).
@@ -24,8 +22,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO
-
 Array = npt.NDArray[np.float64]
 Motion = tuple[Array, ...]
 """q_d, and ω_d and its derivative in the desired body frame."""
@@ -38,9 +34,8 @@ _AT_ONCE: Final = 1e-3
 
 def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:
     """The numbers of a configuration; `late` ticks that a command may be late, by lost frames or else by delay."""
-    law, wire, plant, sensors = settings.law, settings.wire, settings.plant, settings.plant.sensors
+    law, wire, plant = settings.law, settings.wire, settings.plant
     paper, held, nil = law.kind in ("adaptive", "nonadaptive"), wire.actuators == 2, np.zeros(3)
-    gyro, encoders = sensors.rate == "gyro", sensors.rate == "derivative"
     return {
         "J": law.inertia, "B": np.array(law.allocation) * [not held, 1, 1],
         "B_inverse": np.linalg.inv(np.array(law.allocation)) * [[not held], [1], [1]],
@@ -51,12 +46,10 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
         "Gamma": law.Gamma if law.kind == "adaptive" else nil, "adapts": [law.kind == "adaptive"],
         "centre": law.damping_estimate, "radius": [law.damping_bound], "T": [settings.loop.period],
         "delta_eps": [wire.attitude.quantizer().bound], "delta_u": [wire.voltage.quantizer().bound],
-        "delta_omega": [wire.rate.quantizer().bound + gyro * 6 * sensors.gyro_noise],
-        "bias": np.array(sensors.gyro_bias) * gyro,
+        "delta_omega": [wire.rate.quantizer().bound],
         "push": [disturbance + hypot(*plant.friction.coulomb)],
         "up": [plant.rotor.lag_up_s], "down": [plant.rotor.lag_down_s], "held": [held],
-        "encoders": [encoders], "step": encoders * 2 * np.pi / np.array([np.inf, *sensors.counts]),
-        "bandwidth": [sensors.bandwidth], "ratio": [DAMPING_RATIO], "late": [late], "loss": [loss],
+        "late": [late], "loss": [loss],
         "amplitude": np.radians(settings.reference.amplitude), "frequency": settings.reference.frequency,
     }  # fmt: skip
 
@@ -110,11 +103,6 @@ def attitude_of(angle: Array) -> Array:
     """q of roll, pitch and yaw, of which yaw turns first."""
     (a, b, c), (r, p, y) = np.cos(angle / 2).T, np.sin(angle / 2).T
     return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
-
-
-def joints_of(q: Array) -> Array:
-    """0, pitch and yaw of a body whose roll is held."""
-    return 2 * np.stack([0 * q[:, 0], np.arctan2(q[:, 2], q[:, 0]), np.arctan2(q[:, 3], q[:, 0])], axis=1)
 
 
 def desired(c: Any, t: Array) -> Motion:
@@ -174,15 +162,13 @@ def held_axis(q: Array) -> Array:
 
 
 class State(NamedTuple):
-    """q, ω and the rotors' voltages; θ̂ and the integral; angles and rates as the encoders' filter has them."""
+    """q, ω and the rotors' voltages; θ̂ and the integral."""
 
     q: Array
     omega: Array
     V: Array
     theta: Array
     integral: Array
-    angle: Array
-    rate: Array
 
 
 def advance(c: Any, x: State, u: Array, theta: Array, push: Array) -> State:
@@ -213,59 +199,33 @@ def in_balance(c: Any, now: Motion, theta: Array, theta_hat: Array, start: Array
     eps = np.where(c.ki > 0, 0, slow / (c.kp + c.C1 * c.C2)) + start[:, :3]
     e = np.concatenate([np.sqrt(1 - dot(eps, eps)), eps], axis=1)
     q, omega = times(now[0], e), start[:, 3:] - c.share * start[:, :3] + to_body(e, now[1])
-    joints = joints_of(q)
-    q, n = np.where(c.held, attitude_of(joints), q), held_axis(q)
+    pitch, yaw = (2 * np.arctan2(q[:, i], q[:, 0]) for i in (2, 3))
+    q, n = np.where(c.held, attitude_of(np.stack([0 * yaw, pitch, yaw], axis=1)), q), held_axis(q)
     omega = omega - c.held * dot(n, omega) * n
-    rate = omega / np.cos(joints[:, 1:2] * [0, 0, 1])
     integral = np.where(c.ki > 0, slow / np.maximum(c.ki, 1e-9), 0)
     V = by(c.B_inverse, torque_of(c, q, omega, now, theta_hat, integral)[0])
-    return State(q, omega, V, theta_hat, integral, joints - 2 * c.ratio / c.bandwidth * rate, rate)
-
-
-def seen(c: Any, x: State, joints: Array, F: Array) -> tuple[Array, Array, State]:
-    """q and ω as the sensors have them before quantization, where encoders count these joint angles."""
-    gap = x.angle - joints
-    x = x._replace(
-        angle=joints + F[..., 0, 0] * gap + F[..., 0, 1] * x.rate, rate=F[..., 1, 0] * gap + F[..., 1, 1] * x.rate
-    )
-    sine, cosine = np.sin(joints[:, 1]), np.cos(joints[:, 1])
-    omega = np.stack([-sine * x.rate[:, 2], x.rate[:, 1], cosine * x.rate[:, 2]], axis=1)
-    return np.where(c.encoders, attitude_of(joints), x.q), np.where(c.encoders, omega, x.omega + c.bias), x
-
-
-def filter_matrix(c: Any) -> Array:
-    """Of the encoders' filter, for how far its angle is from a held one, and its rate. Shape (rows, 2, 2)."""
-    w, zeta = c.bandwidth[:, 0], c.ratio[:, 0]
-    return np.stack([np.stack([0 * w, 0 * w + 1], axis=1), np.stack([-(w**2), -2 * zeta * w], axis=1)], axis=1)
+    return State(q, omega, V, theta_hat, integral)
 
 
 def costates(c: Any, target: Array, ticks: int) -> Array:
-    """∂(target · (ε̃, ω_e) at the end)/∂x at each tick. Shape (ticks + 1, 6, rows, 3).
-
-    x of an axis: ε̃, ω_e, the integral, angle and rate of the encoders' filter, the torque of the rotors.
-    """
-    A = np.zeros((*c.J.shape, 6, 6))
-    lag, stiff, damp = (
-        np.maximum((c.up + c.down) / 2, _AT_ONCE),
-        c.kp + c.C1 * c.C2,
-        c.C2 + c.kd + c.J * c.C1 / 2 - c.centre,
-    )
-    feedback = np.stack([-stiff, -damp * (1 - c.encoders), -c.ki, 0 * damp, -damp * c.encoders, 0 * damp], axis=-1)
-    rotors = (c.up > 0)[..., None]
-    A[..., 0, 1], A[..., 3, 4] = 0.5, 1.0
-    A[..., 1, :] = np.where(rotors, np.eye(6)[5], feedback) / c.J[..., None]
+    """∂(target · (ε̃, ω_e) at the end)/∂x of ε̃, ω_e, the integral, the rotors at each tick. (ticks + 1, 4, rows, 3)."""
+    A = np.zeros((*c.J.shape, 4, 4))
+    lag, stiff = np.maximum((c.up + c.down) / 2, _AT_ONCE), c.kp + c.C1 * c.C2
+    damp = c.C2 + c.kd + c.J * c.C1 / 2 - c.centre
+    feedback = np.stack([-stiff, -damp, -c.ki, 0 * damp], axis=-1)
+    A[..., 0, 1] = 0.5
+    A[..., 1, :] = np.where((c.up > 0)[..., None], np.eye(4)[3], feedback) / c.J[..., None]
     A[..., 1, 1] -= c.centre / c.J
     A[..., 2, 0], A[..., 2, 1], A[..., 2, 2] = c.share * (c.ki > 0), c.ki > 0, -1.0 * (c.ki == 0)
-    A[..., 4, 0], A[..., 4, 3], A[..., 4, 4] = 2 * c.bandwidth**2, -(c.bandwidth**2), -2 * c.ratio * c.bandwidth
-    A[..., 5, :] = (feedback - np.eye(6)[5]) / lag[..., None]
+    A[..., 3, :] = (feedback - np.eye(4)[3]) / lag[..., None]
     # Rows of the same configuration follow each other and share A.
     first = np.unique(c.case, return_index=True)[1]
     step = np.swapaxes(expm(A[first] * c.T[first, :, None, None]), -1, -2)
-    found = np.zeros((ticks + 1, len(first), 3, 6, len(target) // len(first)))
+    found = np.zeros((ticks + 1, len(first), 3, 4, len(target) // len(first)))
     found[ticks, :, :, :2] = target.reshape(len(first), -1, 2, 3).transpose(0, 3, 2, 1)
     for i in reversed(range(ticks)):
         found[i] = step @ found[i + 1]
-    return found.transpose(0, 3, 1, 4, 2).reshape(ticks + 1, 6, len(target), 3)
+    return found.transpose(0, 3, 1, 4, 2).reshape(ticks + 1, 4, len(target), 3)
 
 
 def run(
@@ -273,27 +233,22 @@ def run(
 ) -> tuple[Array, Array]:
     """All experiments, until the reference's time `end`, with `target` over (ε̃, ω_e) to be as large as can be then.
 
-    Returns:
-        The largest of each of QUANTITIES, shape (rows, 6); and the target that each would have there, (rows, 6, 6).
+    Returns the largest of each of QUANTITIES, shape (rows, 6), and the target that ‖z‖ would have where it was largest.
     """
     rows, p = np.arange(len(end)), costates(c, target, ticks)
     wide = SimpleNamespace(**{name: each[:, None] for name, each in vars(c).items()})
     alone = np.concatenate([np.zeros((1, 6)), np.identity(6)])[None]
-    F = expm(filter_matrix(c) * c.T[..., None])[:, None]
     x = in_balance(c, desired(c, end - ticks * c.T[:, 0]), theta, theta_hat, start)
     commands, in_force, lost_before = [x.V] * (int(c.late.max()) + 1), 0 * rows, 0 * rows
-    best, where, nil = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6)), np.zeros((len(rows), 3))
+    best, where = np.zeros((len(rows), 6)), np.zeros((len(rows), 6))
     for i in range(ticks):
         now, costate = desired(c, end - (ticks - i) * c.T[:, 0]), p[i + 1]
         eta_e, eps_e, omega_e, *_ = errors(x.q, x.omega, now)
-        z2, omega, eps = omega_e + c.share * eps_e, x.omega, x.q[:, 1:]
-        push = np.where(c.up > 0, costate[5] / np.maximum(c.up, _AT_ONCE), costate[1] / c.J)
+        z2 = omega_e + c.share * eps_e
+        push = np.where(c.up > 0, costate[3] / np.maximum(c.up, _AT_ONCE), costate[1] / c.J)
 
-        # Errors of encoders, then vertices of the quantizers: each sign by what that error alone does.
-        gain = costate[3] * (1 - F[..., 0, 0]) - costate[4] * F[..., 1, 0] - c.T * push * c.kp / 2
-        q_seen, omega_seen, x = seen(c, x, joints_of(x.q) + c.step / 2 * np.sign(gain), F)
-
-        def received(signs: Array, q: Array = q_seen, omega: Array = omega_seen) -> tuple[Array, Array]:
+        # Vertices of the quantizers: each sign by what that error alone does.
+        def received(signs: Array, q: Array = x.q, omega: Array = x.omega) -> tuple[Array, Array]:
             eps_Q = q[:, None, 1:] + wide.delta_eps * signs[..., :3]
             rest = np.sqrt(np.maximum(0.0, 1 - dot(eps_Q, eps_Q)))
             q_Q = np.concatenate([np.where(q[:, None, :1] < 0, -rest, rest), eps_Q], axis=2)
@@ -321,16 +276,10 @@ def run(
         x = x._replace(theta=theta_hat, integral=integral)
         x = advance(c, x, np.array(commands)[chosen, rows], theta, c.push * unit(costate[1] / c.J))
 
-        z, volts = np.sqrt((1 - eta_e[:, 0]) ** 2 + norm(eps_e) ** 2 + norm(z2) ** 2), np.abs(u)
-        most = [norm(omega_e), np.abs(omega).max(1), np.abs(eps).max(1), volts.max(1)]
-        found = np.stack([z, norm(eps_e), *most], axis=1)
-        axis, motor = np.identity(3)[np.abs(omega).argmax(1)] * np.sign(omega), volts.argmax(1)
-        volt = -c.B_inverse[rows, motor] * np.sign(u[rows, motor])[:, None]
-        towards = (eps_e + c.share * z2, z2), (eps_e, nil), (nil, omega_e), (nil, axis), (eps_e, nil)
-        volt_target = volt * (c.kp + c.C1 * c.C2), volt * (c.C2 + c.kd)
-        targets = np.stack([np.concatenate(each, axis=1) for each in (*towards, volt_target)], axis=1)
-        better = found > best
-        best, where = np.where(better, found, best), np.where(better[..., None], targets, where)
+        z = np.sqrt((1 - eta_e[:, 0]) ** 2 + norm(eps_e) ** 2 + norm(z2) ** 2)
+        most = [norm(omega_e), np.abs(x.omega).max(1), np.abs(x.q[:, 1:]).max(1), np.abs(u).max(1)]
+        where = np.where((z > best[:, 0])[:, None], np.concatenate([eps_e + c.share * z2, z2], axis=1), where)
+        best = np.maximum(best, np.stack([z, norm(eps_e), *most], axis=1))
     return best, where
 
 
@@ -359,11 +308,10 @@ def worst(known: list[dict[str, Any]], rows: int, generations: int, ticks: int) 
         reached, where = run(c, end, c.centre + c.radius * theta, first, unit(target), start, ticks)
         found = reached.reshape(cases, rows, -1)
         best = np.maximum(best, found.max(axis=1))
-        # Children of the worst three experiments for one of the quantities, half of them for ‖z‖.
-        quantity, group = np.resize([0, 1, 0, 2, 3, 0, 5, 0], rows), np.arange(cases)[:, None]
-        order = np.argsort(-found, axis=1)[group, rng.integers(0, 3, (cases, rows)), quantity]
-        parent = (order + group * rows).ravel()
-        target = unit(where[parent, np.tile(quantity, cases)]) + 0.1 * rng.standard_normal((total, 6))
+        # Children of the three experiments in which ‖z‖ was largest.
+        worst_of = np.argsort(-found[..., 0], axis=1)[np.arange(cases)[:, None], rng.integers(0, 3, (cases, rows))]
+        parent = (worst_of + np.arange(cases)[:, None] * rows).ravel()
+        target = unit(where[parent]) + 0.1 * rng.standard_normal((total, 6))
         end = end[parent] + rng.choice([0, 0.3, 2], total) * rng.standard_normal(total)
         theta, estimate = (each[parent] + 0.15 * rng.standard_normal((total, 3)) for each in (theta, estimate))
     return best

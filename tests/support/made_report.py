@@ -43,24 +43,11 @@ def made_report(
     settings: dict[str, Any] | None = None,
     thinned: int = 1,
     phase: float = 0.0,
-    turned: bool = False,
     theorem: TheoremFindings | None = None,
 ) -> Report:
-    """Ten seconds of sines, with one trip and one gap.
-
-    Args:
-        name: What to call it.
-        marks: What happened.
-        checks: Limits that were asked for.
-        damages: What could not be read.
-        settings: Sections of the configuration over the usual ones.
-        thinned: Ticks behind two points.
-        phase: Of the measured lines [rad]; the desired ones do not change with it.
-        turned: Whether they are turned around.
-        theorem: What became of the theorem.
-    """
+    """Ten seconds of sines, with one trip and one gap; `phase` is that of the measured lines [rad]."""
     time = np.linspace(0.0, 10.0, 501)
-    desired, measured = np.sin(time) * (-1.0 if turned else 1.0), np.sin(time - phase) + 0.02 * np.cos(31 * time)
+    desired, measured = np.sin(time), np.sin(time - phase) + 0.02 * np.cos(31 * time)
     tenth = np.where(np.arange(501) % 10 == 0, measured, np.nan)
     panels = [
         *(
@@ -68,15 +55,14 @@ def made_report(
                   [Line("measured", measured), Line("desired", desired, desired=True)])
             for label in ("ε₁", "ε₂")
         ),
-        Panel("attitude_error", "Figure C.9: Attitude error with quantization", "ε̃₁", "1",
+        Panel("error", "Figure C.9: Attitude error with quantization", "ε̃₁", "1",
               [Line("measured", measured)]),
         Panel("input", "Figure C.11: Input with quantization", "u₂", "V", [Line("commanded", 20 * measured)]),
         Panel("damping_estimate", "Damping estimate", "θ̂₁", "N·m·s/rad", [Line("estimated", tenth)]),
-        Panel("latency", "Loop latency", "latency", "µs",
-              [Line("latency", np.where(measured > 1.01, 90_000.0, 600.0))]),
+        Panel("latency", "Loop latency", "latency", "ms", [Line("latency", np.where(measured > 1.01, 90.0, 0.6))]),
     ]  # fmt: skip
     if theorem is not None:
-        panels.append(Panel("z_norm", "Error of Theorem 1", "‖z‖", "1", [Line("measured", np.abs(measured))]))
+        panels.append(Panel("theorem", "Error of Theorem 1", "‖z‖", "1", [Line("measured", np.abs(measured))]))
     spread = Spread(count=854, p50=640.0, p90=690.0, p99=2400.0, p999=5900.0, max=6011.0, bins=BINS)
     findings = Findings(
         duration_s=10.0,
@@ -154,14 +140,14 @@ def made_theorem(*, broken: int = 0) -> TheoremFindings:
         outside={"C.28": 0, "C.29": 120, "C.30": 0, "Assumption 3": 0},
         judged=380,
         lemma=[
-            LemmaCheck(equation="C.52", what="‖d₁‖", samples=380, broken=0, closest=0.58, closest_s=7.5, broken_s=None),
+            LemmaCheck(equation="C.52", what="‖d₁‖", samples=380, broken=0, closest=0.58, closest_s=7.5),
             LemmaCheck(
                 equation="C.57",
                 what="‖Φ − Φ^Q‖",
                 samples=380,
                 broken=broken,
-                closest=1.25 if broken else 0.97,
                 closest_s=4.25,
+                closest=1.25 if broken else 0.97,
                 broken_s=3.125 if broken else None,
             ),
         ],

@@ -122,14 +122,6 @@ class Law(ABC, Generic[T]):
         self.period = period
         self.actuators = actuators
 
-    @classmethod
-    def certify(cls, configured: Any) -> Mapping[str, Any] | None:  # noqa: ARG003  # for those that override it
-        """What is proven with this law: `holds` and `verdict`, with whatever else; None if nothing.
-
-        `configured` is the whole configuration, with sections as in the TOML file.
-        """
-        return None
-
 
 class ExpressionLaw(Law[T]):
     """A law of CasADi expressions."""

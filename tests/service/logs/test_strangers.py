@@ -19,7 +19,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.report.page import page
 from aeroloop.service.review.compare import read_runs
 from aeroloop.service.review.report import Findings
-from aeroloop.service.review.review import read, report
+from aeroloop.service.review.review import read
 from aeroloop.service.viewers.channels import Decoder
 from tests.support.edited_log import Said, contents, rewrite
 from tests.support.every_message import MESSAGES
@@ -125,7 +125,7 @@ def test_a_review_a_page_and_a_comparison_are_those_of_the_clean_log(clean: Path
     assert named(bad.damages) == set(READ)
     one, other = read_runs([clean, dirty])
     assert without_names(other.findings) == without_names(one.findings)
-    assert len(page([report([dirty])])) > 10_000
+    assert len(page([read(dirty).report()])) > 10_000
 
 
 def test_both_ends_replay_and_it_is_said_what_was_malformed(

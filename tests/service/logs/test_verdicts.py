@@ -14,7 +14,7 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.report.page import page
 from aeroloop.service.review.requirements import Limit
-from aeroloop.service.review.review import read, report
+from aeroloop.service.review.review import read
 from tests.support.edited_log import Said, rewrite
 from tests.support.made_log import lockstep, make_log
 from tests.support.mcap_parts import chunks, with_a_damaged_chunk
@@ -125,7 +125,7 @@ def test_a_replay_names_what_it_did_not_compare_and_fails_where_ticks_are_missin
 def test_a_requirement_that_seems_met_fails_where_ticks_are_missing_or_a_file_is_damaged(
     damaged: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert Verdict(capsys, "review", whole, "--require", "skipped=0").code == 0
+    assert Verdict(capsys, "review", whole, "--require", "skipped_ticks=0").code == 0
     missing = sum(read(damaged).findings.missing_ticks.values())
     verdict = Verdict(capsys, "review", damaged, "--require", "z_track=1")
     assert verdict.code == 1
@@ -154,6 +154,6 @@ def test_a_comparison_and_a_page_say_it_too(damaged: Path, whole: Path, capsys: 
     assert verdict.code == 1
     assert verdict.err.startswith("aeroloop: damaged: z_track ≤ 1 s does not hold: 0.")
     assert "but not seen: " in verdict.err
-    html = page([report([damaged], [Limit.parse("z_track=1")])])
+    html = page([read(damaged).report([Limit.parse("z_track=1")])])
     assert "1 of 1 limit broken" in html
     assert "but not seen: " in html

@@ -12,8 +12,7 @@ import pytest
 from aeroloop.protocol.messages.models import FaultStatus, Status
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.lab.demo import DemoFigures
-from aeroloop.service.report.page import judgement, page
+from aeroloop.service.report.page import verdict
 from aeroloop.service.review.report import FaultInterval
 from aeroloop.service.review.review import read
 from tests.support.edited_log import edited, message_of, rewrite
@@ -53,39 +52,18 @@ def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(fau
     ]  # fmt: skip
 
 
-def test_events_have_the_same_times_as_the_intervals_which_need_no_event(faulty: Path, tmp_path: Path) -> None:
+def test_the_verdict_names_the_faults(faulty: Path) -> None:
     findings = read(faulty).findings
-    times = {mark.text.split(": ")[1].split(",")[0]: mark.time_s for mark in findings.marks if "begins" in mark.text}
-    assert times == {fault.fault: fault.begin_s for fault in findings.faults}
-    without = rewrite(faulty, tmp_path / "a.mcap", lambda one: None if one.topic == "event" else one)
-    quiet = read(without).findings
-    assert [mark for mark in quiet.marks if mark.role == "plant"] == []
-    assert quiet.faults == findings.faults
+    word, good, because = verdict(findings)
+    assert (word, good) == ("Faults", None)
+    counts = f"{findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
+    assert f"3 faults acted at the plant: {counts}." in because
 
 
-def test_the_verdict_and_the_page_name_the_faults(faulty: Path) -> None:
-    review = read(faulty)
-    found, made = judgement(review.findings), review.report()
-    assert found.word == "Tracked, with faults"
-    counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
-    assert f"3 faults acted at the plant: {counts}." in found.because
-    html = page([made])
-    row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
-    for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):
-        assert cell in row
-
-
-def test_review_and_demo_list_them_first_in_the_terminal_and_as_json(
-    faulty: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("aeroloop.service.lab.demo.run_demo", lambda *_: (DemoFigures.of([faulty]), True))
-    for command in (["log", "review", str(faulty)], ["demo"]):
-        assert execute(command) == 0
-        text = " ".join(capsys.readouterr().out.split())
-        assert text.index("command:drop=0.3@0.2..0.6 0.200 s 0.600 s") < text.index(" z_track ")
-        assert execute([*command, "--json"]) == 0
-        faults = json.loads(capsys.readouterr().out)["faults"]
-        assert [fault["source"] for fault in faults] == ["configured", "injected", "configured"]
+def test_review_lists_them_before_the_figures(faulty: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert execute(["log", "review", str(faulty)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.index("command:drop=0.3@0.2..0.6 0.200 s 0.600 s") < text.index(" z_track ")
 
 
 # ── several sessions and processes ──
