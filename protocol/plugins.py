@@ -30,17 +30,10 @@ class PluginError(AeroloopError):
 
 
 def find(key: str, kind: str, group: str, built_in: Mapping[str, str], base: type[T]) -> type[T]:
-    """The class, derived from `base`, that `kind` names.
+    """The class, derived from `base`, that `kind` names: one of ours, an entry point of `group`, or `module:Class`.
 
-    Args:
-        key: The configuration's key that holds it, such as `law.kind`, for messages.
-        kind: One of ours, an entry point's name, or `package.module:Class`.
-        group: The entry points' group.
-        built_in: Ours, each as `package.module:Class`, by name.
-        base: What the class must derive from.
-
-    Raises:
-        PluginError: There is no such class, its module fails, or it does not derive from `base`.
+    `key` is the configuration's key that holds it, such as `law.kind`, for messages. Raises PluginError if there is no
+    such class, its module fails, or it does not derive from `base`.
     """
     given = f"{key} = {kind!r}"
     target = built_in.get(kind, kind)

@@ -16,7 +16,7 @@ from pydantic_settings import SettingsConfigDict
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
-from aeroloop.protocol.transport.can_format import CanSettings
+from aeroloop.protocol.transport.can_format import CanSettings, counter_fills_frame
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
 from aeroloop.protocol.wording import problems
@@ -90,24 +90,24 @@ class Settings(Target):
     @model_validator(mode="after")
     def _counter_separates_late_frames_from_fresh_ones(self) -> Settings:
         """Check that its range is at least twice the time after which an end acts on missing frames."""
-        wire, period_ns, on_can = self.wire, self.loop.period_ns, self.plant.via == "can"
+        wire, period_ns = self.wire, self.loop.period_ns
         patience_s, name = max(
             (self.plant.watchdog_s, "plant.watchdog_s"), (self.controller.stale_s, "controller.stale_s")
         )
         needed_ns = 2 * round(patience_s * 1e9)
-        if self.loop.lockstep or wire.freshness_ns(period_ns) >= needed_ns or (on_can and self.can.short_counter):
+        if self.loop.lockstep or wire.freshness_ns(period_ns) >= needed_ns:
+            return self
+        if self.plant.via == "can" and counter_fills_frame(self.can, wire):
             return self
         enough = [b for b in range(MIN_COUNTER_BITS, MAX_COUNTER_BITS + 1) if period_ns << b >= needed_ns]
-        ways = [
+        way = (
             f"set it to {enough[0]}"
             if enough
             else f"even {MAX_COUNTER_BITS} bits are too few; shorten {name}, or lower loop.rate_hz"
-        ]
-        if on_can:
-            ways.append("can.short_counter = true accepts it")
+        )
         raise ValueError(
             f"wire.counter_bits = {wire.counter_bits} counts {wire.freshness_ns(period_ns) * 1e-6:g} ms, less than "
-            f"twice {name}, which is {patience_s * 1e3:g} ms: {', or '.join(ways)}"
+            f"twice {name}, which is {patience_s * 1e3:g} ms: {way}"
         )
 
     def description(self) -> dict[str, Any]:

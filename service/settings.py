@@ -44,19 +44,11 @@ class ControllerSettings(BaseModel, extra="forbid"):
 class RecorderSettings(BaseModel, extra="forbid"):
     """Settings of the recorder."""
 
-    directory: Path = Field(default=Path("logs"), description="folder of logs without a given path")
-    path: Path | None = Field(
-        default=None,
-        description="the log's first file, or a folder (a name without an ending is one)",
-    )
-    chunk_s: float = Field(
-        default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"
-    )
-    decoded_hz: float = Field(
-        default=10.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"
+    path: Path = Field(
+        default=Path("logs"),
+        description="folder of the logs (a name without an ending is one), or the log's first file",
     )
     max_file_mb: float = Field(default=256.0, gt=0, description="begin a new file after this size [MB]")
-    max_file_s: float = Field(default=3600.0, gt=0, description="begin a new file after this time [s]")
     keep_gb: float | None = Field(
         default=None,
         gt=0,

@@ -179,7 +179,7 @@ class Bridge:
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
             self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
-            if bus.mend():
+            if bus.reopen():
                 self._role.event("changed", "the bus is open again")
         elif relay.session is not None and peer is not None and bus.silent:
             relay.expire(TripCause.NODE, f"{node} has been silent for {bus.silent_s() * 1e3:.0f} ms")

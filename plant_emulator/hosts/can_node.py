@@ -54,7 +54,7 @@ class CanNetwork(PlantNetwork):
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
             self._warn("bus", "fault", f"{bus.fault}; trying again twice a second")
-            bus.mend()
+            bus.reopen()
         peer = bus.peer
         if peer is None or bus.silent:
             endpoint.lost(MASTER)

@@ -68,7 +68,6 @@ class PlantTrace:
 
     def __init__(
         self,
-        loop: LoopSettings,
         wire: WireSpec,
         publish: Callable[[bytes], None],
         run: int | None = None,
@@ -76,7 +75,7 @@ class PlantTrace:
     ) -> None:
         self._publish, self._clock = publish, clock
         run = secrets.randbits(64) if run is None else run
-        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
+        self._writer = TraceWriter("plant", wire, run)
 
     def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Add the row of the last tick, and publish a batch that is due. Nothing without a session."""

@@ -37,7 +37,7 @@ from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
-from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
+from aeroloop.protocol.runtime.timing import RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -65,7 +65,7 @@ class ZenohNetwork(PlantNetwork):
         super().__init__()
         self._role, self._loop, self._endpoint, self._changed = role, loop, endpoint, changed
         self._link: ZenohLink | None = None
-        self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
+        self._trace = PlantTrace(endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
         self._counters = endpoint.wire.measurement.counters
         self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
@@ -176,9 +176,9 @@ class ZenohNetwork(PlantNetwork):
                 refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
                 stale=endpoint.stale,
                 saturated=endpoint.saturated,
-                latency_us=summary(self._latency.total),
-                recent_latency_us=summary(self._latency.recent()),
-                timing=report(self.timing) if self.timing else None,
+                latency_us=self._latency.total.summary(),
+                recent_latency_us=self._latency.recent().summary(),
+                timing=self.timing.report() if self.timing else None,
                 notes=self.notes,
                 lacks_recorder="gone" if self._recorder.gone else None,
                 faults=self.faults(),

@@ -21,8 +21,6 @@ STATUS_VALUES: Final = 2048
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
 ]
-
-
 Source = Literal["configured", "operator", "resumed", "held"]
 """Where gains or a reference come from: the configuration, an operator, the session before, or the attitude found."""
 
@@ -37,15 +35,10 @@ def _no_other_topics_key(session: str) -> str:
 
 SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"), AfterValidator(_no_other_topics_key)]
 """One chunk of a key, and not the first chunk of a topic's key."""
-
-
 TokenName = Annotated[str, StringConstraints(pattern=r"^[^/*$#?]{1,64}$")]
 """One chunk of a liveliness token's key, without wildcards."""
-
-
 MAX_SIGNALS: Final = 16
 """So many fit into the 2 KiB of a true state."""
-
 Signals = Annotated[
     dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")], FiniteFloat | None],
     Field(max_length=MAX_SIGNALS),
@@ -89,10 +82,7 @@ class SessionRecord(Message):
 
     @property
     def in_force(self) -> list[Change]:
-        """The changes that set gains and reference; none without a session, and of a stream, whose set-points it lacks.
-
-        They are those of `operator.in_force` for the trace's changes.
-        """
+        """The changes in force, as `operator.in_force` gives; none without a session, or of a stream."""
         if self.session is None or isinstance(self.reference, Stream):
             return []
         gains = Change(session=self.session, tick=self.gains_since_tick, gains=self.gains)
@@ -136,13 +126,8 @@ class Description(Message):
     versions: dict[str, str]
     facts: dict[str, str] = Field(default_factory=dict, description="the host, and its properties that affect timing")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
-    freshness_s: float | None = Field(
-        default=None,
-        description="2^counter_bits periods: a frame that is later than this may be taken for a newer one [s]",
-    )
     certificate: dict[str, Any] | None = Field(
-        default=None,
-        description="controller: certificate of its configuration, as `aeroloop lab certify --json` prints it",
+        default=None, description="controller: of its configuration, as `aeroloop lab certify --json` prints it"
     )
 
 
@@ -186,9 +171,7 @@ class Status(Message):
     state: str
     session: str | None = None
     cause: str | None = Field(
-        default=None,
-        description="plant: why it is not armed; controller: why it claims no vehicle; recorder: why nothing is "
-        "written; null otherwise",
+        default=None, description="why a plant is not armed, a controller claims no vehicle, a recorder writes nothing"
     )
     process: str = Field(default="", description="host and process id of the role")
     since: AwareDatetime | None = Field(default=None, description="plant: when the cause arose, UTC")
@@ -213,22 +196,18 @@ class Status(Message):
     lost: int = Field(default=0, description="recorder: messages missing in its log since start")
     lacks_recorder: Literal["gone", "required"] | None = Field(
         default=None,
-        description="plant, controller: gone: a recorder was there, and disappeared without a last status `stopped`; "
-        "controller: required: none is there, and it claims no vehicle without one",
+        description="gone: it disappeared without a last status `stopped`; required: the controller waits for one",
     )
     latency_us: Percentiles | None = Field(
-        default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
+        default=None, description="plant: from a measurement sent to its answer, plant's clock"
     )
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     age_us: Percentiles | None = Field(
-        default=None,
-        description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
+        default=None, description="controller: from a measurement received to its answer sent, last 10 s [µs]"
     )
     timing: Timing | None = Field(default=None, description="timing of the loop; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="settings that the host refused")
-    faults: list[FaultStatus] = Field(
-        default_factory=list, description="emulated plant: faults that act, have acted, or are to come"
-    )
+    faults: list[FaultStatus] = Field(default_factory=list, description="emulated plant: past, acting and to come")
     gains: Gains | None = Field(default=None, description="controller: its gains, of the next session if none runs")
     gains_from: Source | None = None
     reference: str | None = Field(default=None, description="controller: its reference, in words; likewise")

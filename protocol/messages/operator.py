@@ -7,7 +7,7 @@ rate and acceleration never jump.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from math import isfinite, pi
+from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import (
@@ -16,6 +16,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    FiniteFloat,
     SerializerFunctionWrapHandler,
     StringConstraints,
     ValidationError,
@@ -30,7 +31,7 @@ MAX_POINTS: Final = 10_000
 MAX_WITHIN_S: Final = 600.0
 
 MAX_VALUES: Final = 256
-"""Values of an ordinary message: a claim has 17, a request that injects 64 faults 65."""
+"""Values of an ordinary message: a request that injects 64 faults has 65."""
 REFERENCE_VALUES: Final = 4 * MAX_POINTS + MAX_VALUES
 """Values of what may hold a reference of `MAX_POINTS` points, which takes some 10 ms to parse."""
 
@@ -67,15 +68,8 @@ class Message(BaseModel):
             raise MessageError(f"not a {cls.__name__}: {problem(error, cls)}") from None
 
 
-def _finite(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    if not all(isfinite(value) for value in numbers):
-        raise ValueError("every element must be a number")
-    return numbers
-
-
-Angles = Annotated[tuple[float, float, float], AfterValidator(_finite)]
+Angles = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 """Roll, pitch, yaw [deg]."""
-
 Frequency = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -102,15 +96,15 @@ class Points(Message):
     """Attitudes at given times, joined smoothly, from rest to rest; the last one is held."""
 
     kind: Literal["points"] = Field(default="points", description="which reference")
-    times: list[float] = Field(min_length=2, max_length=MAX_POINTS, description="rising, from 0 [s]")
+    times: list[FiniteFloat] = Field(min_length=2, max_length=MAX_POINTS, description="rising, from 0 [s]")
     attitudes: list[Angles] = Field(min_length=2, max_length=MAX_POINTS, description="roll, pitch, yaw each [deg]")
 
     @model_validator(mode="after")
     def _a_time_for_each(self) -> Points:
         if len(self.times) != len(self.attitudes):
             raise ValueError(f"{len(self.times)} times for {len(self.attitudes)} attitudes")
-        if self.times[0] != 0 or not all(isfinite(t) for t in self.times):
-            raise ValueError("the first time must be 0, and every time a number")
+        if self.times[0] != 0:
+            raise ValueError("the first time must be 0")
         if any(after - before < 1e-3 - 1e-9 for before, after in zip(self.times, self.times[1:], strict=False)):
             raise ValueError("times must rise by at least a millisecond")
         return self
@@ -130,20 +124,17 @@ Reference = Annotated[Sinusoid | Hold | Points | Stream, Field(discriminator="ki
 def in_words(reference: Reference) -> str:
     """A reference in a few words."""
     match reference:
-        case Sinusoid(amplitude=amplitude):
-            return f"a sinusoid of {_degrees(amplitude)}"
-        case Hold(attitude=None):
-            return "where it is"
-        case Hold(attitude=attitude) if attitude is not None:
-            return _degrees(attitude)
+        case Sinusoid(amplitude=angles):
+            words = "a sinusoid of "
+        case Hold(attitude=angles):
+            words = ""
         case Points(times=times):
             return f"{len(times)} points over {times[-1]:g} s"
         case _:
             return "a stream of set-points"
-
-
-def _degrees(angles: Sequence[float]) -> str:
-    return "roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)
+    if angles is None:
+        return "where it is"
+    return f"{words}roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)
 
 
 class Setpoint(Message):
@@ -156,15 +147,13 @@ MAX_GAINS: Final = 32
 """The most gains of a law, and numbers of a gain."""
 
 
-def _numbers(gain: Any) -> Any:
-    return (gain,) if isinstance(gain, int | float) else gain
-
-
 Gain = Annotated[
-    tuple[float, ...],
+    tuple[FiniteFloat, ...],
     Field(min_length=1, max_length=MAX_GAINS),
-    BeforeValidator(_numbers, json_schema_input_type=float | tuple[float, ...]),
-    AfterValidator(_finite),
+    BeforeValidator(
+        lambda gain: (gain,) if isinstance(gain, int | float) else gain,
+        json_schema_input_type=float | tuple[float, ...],
+    ),
 ]
 """The numbers of a gain; a single one may stand without brackets."""
 
@@ -222,8 +211,7 @@ class Track(Message):
         default=None,
         ge=0.02,
         le=MAX_WITHIN_S,
-        description="time to reach it from the present one, null: the shortest; coming to rest takes as long as "
-        "braking does [s]",
+        description="time to reach it, or to come to rest; null: the shortest [s]",
     )
 
 
@@ -239,12 +227,10 @@ class Change(Message):
     reference: Reference | None = Field(default=None, description="null: as before")
     within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: a jump [s]")
     start: Angles | None = Field(
-        default=None,
-        description="where the approach to the reference starts, at rest; null: at the reference before [deg]",
+        default=None, description="where the approach to it starts, at rest; null: at the reference before [deg]"
     )
     brake_s: Angles | None = Field(
-        default=None,
-        description="time of it in which roll, pitch, yaw each brake to rest first; null: a single quintic [s]",
+        default=None, description="time in which roll, pitch, yaw each brake to rest first; null: a single quintic [s]"
     )
     run_up_s: Angles | None = Field(
         default=None, description="time of it in which each runs up to the reference's rate at last [s]"

@@ -42,8 +42,6 @@ _READERS: Final[_Roles] = ("operator", "observer", "recorder")
 
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
-
-
 QUERIES_PER_S: Final = 50.0
 """Most queries a second on a topic that a process takes from one link; what comes sooner after another is dropped. One
 rate for all topics: Zenoh applies any of the rules that a wildcard query meets."""
@@ -57,31 +55,17 @@ POINTS_BYTES: Final = 2_097_152  # references of `MAX_POINTS` points: in descrip
 
 @dataclass(frozen=True)
 class Topic:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: Name in this program.
-        key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
-        kind: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
-            reply), `token` (liveliness, no payload).
-        senders: Roles that publish it, hold it or query by it; under its own role where the key has one.
-        receivers: Roles that subscribe to it, watch it or answer it.
-        model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
-        decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
-        limit: Most bytes of payload and attachment of what is published or answered. What is longer is neither
-            published nor received.
-        request: Most bytes of a query, likewise.
-    """
-
-    name: str
-    key: str
-    kind: Literal["frame", "trace", "json", "query", "token"]
-    senders: _Roles
-    receivers: _Roles
-    model: type[Message] | None = None
-    decoded: Literal["always", "limited"] | None = None
-    limit: int = MESSAGE_BYTES
-    request: int = MESSAGE_BYTES
+    name: str  # in this program
+    key: str  # below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in
+    kind: Literal["frame", "trace", "json", "query", "token"]  # bits, batches, a model, request and reply, liveliness
+    senders: _Roles  # publish it, hold it or query by it; under their own role where the key has one
+    receivers: _Roles  # subscribe to it, watch it or answer it
+    model: type[Message] | None = None  # of its messages or requests, if they are JSON
+    decoded: Literal["always", "limited"] | None = None  # for viewers, always or at most at the limited rate
+    limit: int = MESSAGE_BYTES  # most bytes of what is published or answered; what is longer is not received either
+    request: int = MESSAGE_BYTES  # most bytes of a query, likewise
 
     @property
     def recorded(self) -> bool:

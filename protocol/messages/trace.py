@@ -17,9 +17,10 @@ from collections.abc import Sequence
 from enum import IntEnum
 from functools import lru_cache
 from math import prod
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
@@ -27,40 +28,30 @@ from aeroloop.protocol.messages.operator import Change, Message, in_force
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS, LoopSettings, WireSpec
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-Columns: TypeAlias = "dict[str, npt.NDArray[Any]]"
+Columns = dict[str, npt.NDArray[Any]]
 End = Literal["controller", "plant"]
 ENDS: Final[tuple[End, ...]] = ("controller", "plant")
 
+TRACE_NS: Final = 100_000_000
+"""A batch is published this long after its first row [ns]: a process that is killed loses no more."""
 MAX_ROWS: Final = 256
 """Rows of a batch at the most."""
-
 STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
 """Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so they compress
 to a fifth. The first row's step is from 0."""
-
 NEVER: Final = 0xFFFF_FFFF
 """In a column of times or of session ticks: none. Times wrap after 71 minutes, longer than any batch: `due` is checked
 after every row."""
+RECORD_S: Final = 1.0
+"""How often a batch has the session's record [s]."""
 
-_BATCHES_BEYOND: Final = 1.25
-"""Factor for batches beyond those of a steady loop: sessions that begin and end, operations between them."""
-
-_FASTEST_HZ: Final = 10_000.0
-"""Bound on the tick rate in lockstep, where the grid's rate does not apply."""
-
+_RECORD_BYTES_PER_S: Final = 16_384  # a longer record, of many points, is in as many batches as take this much
+_BATCHES_BEYOND: Final = 1.25  # those of sessions that begin and end, and of operations between them
+_FASTEST_HZ: Final = 10_000.0  # bound on the tick rate in lockstep, where the grid's rate does not apply
 _HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
 HEADER_BYTES: Final = _HEADER.size
 _FINAL: Final = 1
-_MARGIN_NS: Final = 1_000_000_000
-"""A batch's times start this long before its first row: a command may be received before the row begins."""
-
-RECORD_S: Final = 1.0
-"""How often a batch has the session's record [s]."""
-_RECORD_BYTES_PER_S: Final = 16_384
-"""A longer record, of many points, is in as many batches as take this much. A cache of a minute has the longest."""
+_MARGIN_NS: Final = 1_000_000_000  # times start this long before the first row: a command may be received before it
 
 
 class Sent(IntEnum):
@@ -72,8 +63,7 @@ class Sent(IntEnum):
     NONE = 0
     FRAME = 1
     SILENT = 2
-    MALFORMED = 3
-    """Received with a wrong length; the row has none of its bytes."""
+    MALFORMED = 3  # received with a wrong length; the row has none of its bytes
 
 
 class Received(IntEnum):
@@ -81,26 +71,20 @@ class Received(IntEnum):
 
     FRAME = 0
     SILENT = 1
-    LATE = 2
-    """The frame arrived after its tick, or stale: its levels hold from the next tick on, and nothing is sent."""
+    LATE = 2  # the frame arrived after its tick, or stale: its levels hold from the next tick on, and nothing is sent
     MALFORMED = 3
 
 
 class Outcome(IntEnum):
     """What the plant did with the command that it received since the last tick."""
 
-    NONE = 0
-    """No command was received; the one in force, if any, is held."""
+    NONE = 0  # no command was received; the one in force, if any, is held
     ACTED = 1
     MALFORMED = 2
-    REPEATED = 3
-    """Its echo is that of the last fresh command, or it answers an older measurement than that did."""
-    STALE = 4
-    """It answers a measurement that is older than the watchdog's time."""
-    INVALID = 5
-    """It has no valid value and answers a measurement that has one: the plant trips."""
-    WITHHELD = 6
-    """Withheld by an injected fault."""
+    REPEATED = 3  # its echo is that of the last fresh command, or it answers an older measurement than that did
+    STALE = 4  # it answers a measurement that is older than the watchdog's time
+    INVALID = 5  # it has no valid value and answers a measurement that has one: the plant trips
+    WITHHELD = 6  # by an injected fault
 
 
 PlantChangeKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject"]
@@ -209,11 +193,7 @@ class Header(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """A decoded batch.
-
-    Attributes:
-        columns: By name. Shapes (rows,), of voltages (rows, actuators).
-    """
+    """A decoded batch. Columns by name have shape (rows,); voltages (rows, actuators)."""
 
     header: Header
     columns: Columns
@@ -226,63 +206,47 @@ class Batch(NamedTuple):
         return np.where(values == NEVER, -1, ns)
 
 
-def read_header(payload: bytes) -> Header | None:
-    """Parse a batch's header; None if it is malformed or of another version."""
+def read_batch(payload: bytes) -> Batch | None:
+    """Parse a batch; None if it is malformed: another version, a wrong length, a tail that is no Tail."""
     if len(payload) < HEADER_BYTES:
         return None
     version, end, flags, *figures, name = _HEADER.unpack_from(payload)
-    actuators, measurement, command = figures[:3]
+    actuators, measurement, command, rows, tail_bytes = figures[:5]
     if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or not 1 <= actuators <= MAX_ACTUATORS:
         return None
-    if not name.isascii() or not measurement or not command:
+    if not name.isascii() or not measurement or not command or rows > MAX_ROWS:
         return None
-    return Header._make((ENDS[end], bool(flags & _FINAL), *figures, name.rstrip(b"\0").decode()))
-
-
-def batch_bytes(header: Header) -> int:
-    """Size of a batch by its header."""
-    return HEADER_BYTES + header.rows * header.row_dtype.itemsize + header.tail_bytes
-
-
-def read_batch(payload: bytes) -> Batch | None:
-    """Parse a batch; None if it is malformed: another version, a wrong length, a tail that is no Tail."""
-    header = read_header(payload)
-    if header is None or header.rows > MAX_ROWS or len(payload) != batch_bytes(header):
+    header = Header._make((ENDS[end], bool(flags & _FINAL), *figures, name.rstrip(b"\0").decode()))
+    kinds = header.row_dtype
+    if len(payload) != HEADER_BYTES + rows * kinds.itemsize + tail_bytes:
         return None
     try:
-        tail = Tail.model_validate_json(payload[-header.tail_bytes :]) if header.tail_bytes else Tail()
+        tail = Tail.model_validate_json(payload[-tail_bytes:]) if tail_bytes else Tail()
     except ValidationError:
         return None
     return Batch(header, read_columns(header, payload), tail)
 
 
 def read_columns(header: Header, payload: bytes) -> Columns:
-    """Columns of a batch whose size is `batch_bytes`, by name, read-only but for those of steps."""
-    columns: Columns = {}
-    at, fields = HEADER_BYTES, header.row_dtype.fields
-    assert fields is not None
-    for name, (kind, *_) in fields.items():
+    """Columns of a well-formed batch, by name; read-only but for those of steps."""
+    columns, kinds, at = Columns(), header.row_dtype, HEADER_BYTES
+    for field in kinds.names or ():
+        kind = kinds[field]
         column = np.frombuffer(payload, kind.base, header.rows * prod(kind.shape), at)
         at += column.nbytes
-        columns[name] = np.add.accumulate(column, dtype=kind) if name in STEPS else column.reshape(-1, *kind.shape)
+        columns[field] = np.add.accumulate(column, dtype=kind) if field in STEPS else column.reshape(-1, *kind.shape)
     return columns
 
 
 class TraceWriter:
-    """Buffers one end's rows and packs them into batches.
+    """Buffers one end's rows and packs them into batches. `run` is a random number of this process, 64 bits.
 
-    `run` is a random number of this process, 64 bits; a batch is due `every_ns` after its first row [ns].
-
-    Attributes:
-        session: Name of the rows' session; set between batches only.
-        state: The controller's state before the first row in the buffer, as JSON; None at the plant.
-        changes: Changes that belong to the rows in the buffer.
-        operations: Operations likewise.
-        record: The session's gains and reference in force, as the JSON of `Tail.record`; empty for none. A controller's
-            is brought up to date by `take`, from the changes.
+    `session` names the rows' session and is set between batches only; `state`, `changes` and `operations` go into the
+    tail of the next batch. `record` is the session's gains and reference in force, as the JSON of `Tail.record`; empty
+    for none. A controller's is brought up to date by `take`, from the changes.
     """
 
-    def __init__(self, end: End, wire: WireSpec, run: int, every_ns: int) -> None:
+    def __init__(self, end: End, wire: WireSpec, run: int) -> None:
         self.end: End = end
         self.session = ""
         self.state: dict[str, Any] | None = None
@@ -296,7 +260,6 @@ class TraceWriter:
         self._rows: list[ControllerRow | PlantRow] = []
         self._run = run
         self._published = 0
-        self._every_ns = every_ns
         self._base_ns = 0
 
     @property
@@ -305,9 +268,9 @@ class TraceWriter:
         return not (self._rows or self.changes or self.operations)
 
     def due(self, now_ns: int) -> bool:
-        """Whether a batch is to be published: the buffer is full, or its first row is `every_ns` old."""
+        """Whether a batch is to be published: the buffer is full, or its first row is `TRACE_NS` old."""
         if self._rows:
-            return len(self._rows) >= MAX_ROWS or now_ns - self._base_ns >= self._every_ns + _MARGIN_NS
+            return len(self._rows) >= MAX_ROWS or now_ns - self._base_ns >= TRACE_NS + _MARGIN_NS
         return not self.empty
 
     def row(self, row: ControllerRow | PlantRow) -> None:
@@ -383,4 +346,4 @@ def record_json(changes: Sequence[Change]) -> bytes:
 def batches_per_s(loop: LoopSettings) -> float:
     """Bound on the batches that an end publishes per second, in the long run."""
     rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
-    return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
+    return _BATCHES_BEYOND * max(1e9 / TRACE_NS, rate_hz / MAX_ROWS)

@@ -13,18 +13,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.endpoint import STREAMS, Endpoint
 
 PACKAGES: Final = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
 """Packages that compute, transport or store the figures in a log."""
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
-_GIT_WAIT_S: Final = 2.0
 _PR_SET_NAME: Final = 15
-_NAME_LENGTH: Final = 15
-"""Characters of a process's name, see prctl(2)."""
-_LISTENS: Final = "0A"
-"""State of a socket in /proc/net/tcp."""
+_LISTENS: Final = "0A"  # state of a socket in /proc/net/tcp
 _ROLES: Final = ("plant", "controller", "recorder", "router")
 
 
@@ -35,7 +31,7 @@ def versions() -> dict[str, str]:
     if (_ROOT / ".git").exists():
         git = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
         with suppress(OSError, subprocess.SubprocessError):
-            done = subprocess.run(git, capture_output=True, text=True, timeout=_GIT_WAIT_S, check=True)  # noqa: S603 - arguments of our own
+            done = subprocess.run(git, capture_output=True, text=True, timeout=2, check=True)  # noqa: S603 - arguments of our own
             found["revision"] = done.stdout.strip()
     return found
 
@@ -81,17 +77,14 @@ class Listener(NamedTuple):
 
 def name_process(role: str) -> None:
     """Name this process after its role, for `ps`, `top` and `listener`."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_NAME, f"{role}@aeroloop"[:_NAME_LENGTH].encode(), 0, 0, 0)
+    with suppress(OSError, AttributeError):  # prctl(2) takes 15 characters
+        ctypes.CDLL(None).prctl(_PR_SET_NAME, f"{role}@aeroloop"[:15].encode(), 0, 0, 0)
 
 
 def listener(endpoint: str) -> Listener | None:
-    """The process of this host that listens at a Zenoh endpoint of TCP or TLS; None where that cannot be found out.
-
-    A process of another user is not found, nor one on another host.
-    """
+    """The process of this user on this host that listens at a Zenoh endpoint of TCP or TLS; None if none is found."""
     place = Endpoint.parse(endpoint)
-    if place.protocol not in ("tcp", "tls"):
+    if place.protocol not in STREAMS:
         return None
     sockets = set()
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):

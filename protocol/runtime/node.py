@@ -31,7 +31,6 @@ from aeroloop.protocol.runtime.timing import Clock, Throttle
 from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
 from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 M = TypeVar("M", bound=Message)
 Action = Callable[[], object]
@@ -139,45 +138,12 @@ class Requests:
         return waiting > 0
 
 
-class LastStatus:
-    """The last status of a node, completed by what its owner does not count."""
-
-    def __init__(self, process: str, certificate_until: Any, clock: Clock) -> None:
-        self._known = {"process": process, "certificate_until": certificate_until}
-        self._clock = clock
-        self._last: tuple[float, Status] | None = None  # and when it was taken; another thread reads it
-        self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
-
-    def take(self, status: Status) -> Status:
-        """The status with process, certificate and ticks skipped in the last 10 s."""
-        now, skipped = self._clock.monotonic(), self._skipped
-        skipped.append((now, status.skipped))
-        while now - skipped[0][0] > _RECENT_S:
-            skipped.popleft()
-        recent = status.skipped - skipped[0][1]
-        status = status.model_copy(update={**self._known, "recent_skipped": recent})
-        self._last = now, status
-        return status
-
-    def aged(self) -> bytes | None:
-        """The last status with its age, which shows a loop that hangs; None before the first."""
-        if self._last is None:
-            return None
-        taken, status = self._last
-        return status.model_copy(update={"age_s": round(self._clock.monotonic() - taken, 3)}).encode()
-
-
 class Node:
     """A process's presence on the network.
 
     `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
     its effective configuration, for the description. `name` is its liveliness token's; the role's if None. Its owner
-    runs until `stop` is set, by `clock`.
-
-    Raises:
-        NetworkError: The network cannot be joined.
-        CertificateError: Its links cannot be secured.
-        OccupiedError: It is a plant's, and the vehicle has one.
+    runs until `stop` is set, by `clock`. Errors are those of `join`, and OccupiedError for a vehicle's second plant.
     """
 
     def __init__(
@@ -200,19 +166,20 @@ class Node:
         name_process(role)
         identity = Identity((role,), vehicle)
         certificate = protected(network, identity).certificate
+        self._certificate_until = certificate and certificate.not_after
         self.zenoh = (route if role == "router" else join)(network, identity)
         self.datagrams = FrameSession(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
-        self.own_versions: dict[str, str] = {}  # of a user's classes that it runs, for its description
         self._publishers: dict[str, CachedPublisher] = {}
         requests = Requests(self.zenoh, vehicle, clock)
         self.serve, self.enqueue, self.take_inbox = requests.serve, requests.enqueue, requests.take_inbox
-        self._status = LastStatus(self.process, certificate and certificate.not_after, clock)
+        self._last: tuple[float, Status] | None = None  # status, and when it was taken; another thread reads it
+        self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
         self._throttle = Throttle(clock=clock)
         self._started = clock.monotonic()
         self.publish_description(config)
         self._answer("description", lambda: self._description)
-        self._answer("status", self._status.aged)
+        self._answer("status", self._aged_status)
 
     def __enter__(self) -> Self:
         return self
@@ -237,10 +204,8 @@ class Node:
     def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
         """Call back when a node's liveliness token appears (True) and disappears, in a thread of its own.
 
-        A token of another name calls no Python. Zenoh merges those of one name: the first appears, the last disappears.
-
-        Returns:
-            Ends it.
+        Returns the end of it. A token of another name calls no Python. Zenoh merges those of one name: the first
+        appears, the last disappears.
         """
         key = topics.key("alive", self.vehicle, role=name)
 
@@ -287,29 +252,40 @@ class Node:
             self.declare(topic, _SELDOM_PER_S)
         self._publishers[topic].put(payload)
 
-    def publish_description(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
-        """Publish the node's description: its effective configuration and, from a controller, its certificate."""
-        freshness_s = None
-        if "wire" in config and "loop" in config:
-            period_ns = LoopSettings.model_validate(config["loop"]).period_ns
-            freshness_s = WireSpec.model_validate(config["wire"]).freshness_ns(period_ns) * 1e-9
+    def publish_description(
+        self, config: dict[str, Any], certificate: dict[str, Any] | None = None, law: dict[str, str] | None = None
+    ) -> None:
+        """Publish the description: effective configuration; of a controller its certificate and its law's version."""
         self._description = Description(
             protocol=PROTOCOL_VERSION,
             role=self.role,
             vehicle=self.vehicle,
             host=socket.gethostname(),
-            versions=versions() | self.own_versions,
+            versions=versions() | (law or {}),
             facts=host_facts(),
             config=config,
-            freshness_s=freshness_s,
             certificate=certificate,
         ).encode()
         self.publish_bytes("description", self._description)
 
     def status(self, status: Status) -> None:
-        """Publish the status, and answer queries with it until the next one."""
+        """Publish the status, with ticks skipped in the last 10 s, and answer queries with it until the next one."""
         notify_systemd("WATCHDOG=1")
-        self.publish("status", self._status.take(status))
+        now = self.clock.monotonic()
+        self._skipped.append((now, status.skipped))
+        while now - self._skipped[0][0] > _RECENT_S:
+            self._skipped.popleft()
+        more = {"recent_skipped": status.skipped - self._skipped[0][1], "certificate_until": self._certificate_until}
+        status = status.model_copy(update={**more, "process": self.process})
+        self._last = now, status
+        self.publish("status", status)
+
+    def _aged_status(self) -> bytes | None:
+        """The last status with its age, which shows a loop that hangs; None before the first."""
+        if self._last is None:
+            return None
+        taken, status = self._last
+        return status.model_copy(update={"age_s": round(self.clock.monotonic() - taken, 3)}).encode()
 
     def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Publish and log an event, with the session's tick if there is one."""
@@ -342,11 +318,7 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
 
 
 class RecorderWatch:
-    """Whether the recorder of a node's vehicle is there, or was there and is gone, killed or cut off.
-
-    Attributes:
-        present: Whether its liveliness token is there.
-    """
+    """Whether the recorder of a node's vehicle is `present`, by its token, or was there and is `gone`."""
 
     def __init__(self, node: Node) -> None:
         self.present = False
@@ -357,7 +329,7 @@ class RecorderWatch:
 
     @property
     def gone(self) -> bool:
-        """Whether it disappeared and its last status does not say that it stopped."""
+        """Whether it was killed or cut off: it disappeared, and its last status does not say that it stopped."""
         if (sample := self._statuses.try_recv()) is not None:
             with suppress(MessageError):
                 self._stopped = Status.decode(sample.payload.to_bytes(), extra="ignore").state == STOPPED

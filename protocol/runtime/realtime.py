@@ -20,6 +20,8 @@ from typing import Final
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import LoopSettings
 
+PRIORITY: Final = 10
+"""Of SCHED_FIFO, above all that is not real-time and below the kernel's own threads, which have 50."""
 _PR_SET_TIMERSLACK: Final = 29
 _MCL_ALL: Final = 1 | 2
 """MCL_CURRENT | MCL_FUTURE."""
@@ -67,9 +69,9 @@ def prepare_process(settings: LoopSettings) -> list[str]:
         refused.append(f"affinity to CPUs {settings.cpus}: {error.strerror}")
     try:
         for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(settings.priority))
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:
-        refused.append(f"SCHED_FIFO {settings.priority}: {error.strerror} (raise LimitRTPRIO)")
+        refused.append(f"SCHED_FIFO {PRIORITY}: {error.strerror} (raise LimitRTPRIO)")
     if refused and settings.realtime == "strict":
         raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
     try:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from itertools import accumulate
 from math import exp2, log2
 from typing import Final, Protocol
 
@@ -14,30 +15,19 @@ from aeroloop.protocol.messages.models import Percentiles, Timing
 
 
 class Clock(Protocol):
-    """What a loop needs of the module `time`, which is the real clock."""
+    """What a loop needs of the module `time`, which is the real clock: seconds, nanoseconds, ns since 1970."""
 
-    def monotonic(self) -> float:
-        """Monotonic time [s]."""
-
-    def monotonic_ns(self) -> int:
-        """Monotonic time [ns]."""
-
-    def time_ns(self) -> int:
-        """Wall clock, nanoseconds since 1970."""
-
-    def sleep(self, seconds: float, /) -> None:
-        """Wait [s]."""
+    def monotonic(self) -> float: ...  # noqa: D102
+    def monotonic_ns(self) -> int: ...  # noqa: D102
+    def time_ns(self) -> int: ...  # noqa: D102
+    def sleep(self, seconds: float, /) -> None: ...  # noqa: D102
 
 
 class TickGrid:
     """Absolute deadlines: tick k is due at `start_ns + k·period_ns`, on `Clock.monotonic_ns`.
 
-    After a stall the grid continues at the next deadline ahead and counts the missed ticks; it never bursts to catch
-    up, because a plant does not.
-
-    Attributes:
-        tick: Index of the last tick waited for; −1 before the first.
-        skipped: Ticks missed so far.
+    After a stall the grid continues at the next deadline ahead; it never bursts to catch up, because a plant does not.
+    `tick` is the index of the last tick waited for, −1 before the first; `skipped` counts missed ticks.
     """
 
     def __init__(self, period_ns: int, start_ns: int | None = None, clock: Clock = time) -> None:
@@ -120,13 +110,19 @@ class Histogram:
 
     def percentile(self, percent: float) -> float:
         """The middle of the bin that holds this percentile [µs]; NaN if nothing was counted."""
+        bins = sorted(self._bins.items())
         wanted = self.count * percent / 100
-        seen = 0
-        for i, n in sorted(self._bins.items()):
-            seen += n
+        for (i, _), seen in zip(bins, accumulate(n for _, n in bins), strict=True):
             if seen >= wanted:
                 return min(exp2((i + 0.5) / self.PER_OCTAVE), self.max_us)
         return float("nan")
+
+    def summary(self) -> Percentiles | None:
+        """Percentiles for a status; None if nothing was counted."""
+        if not self.count:
+            return None
+        found = {name: round(self.percentile(at), 1) for name, at in (("p50", 50), ("p99", 99), ("p999", 99.9))}
+        return Percentiles(count=self.count, max=round(self.max_us, 1), **found)
 
 
 class RollingHistogram:
@@ -195,21 +191,11 @@ class LoopTiming:
         """Pause: the time until the next tick is no period."""
         self._woke_at = 0
 
-
-def summary(durations: Histogram) -> Percentiles | None:
-    """Percentiles of a histogram; None if it is empty."""
-    if not durations.count:
-        return None
-    points = {"p50": 50, "p99": 99, "p999": 99.9}
-    found = {name: round(durations.percentile(percent), 1) for name, percent in points.items()}
-    return Percentiles(count=durations.count, max=round(durations.max_us, 1), **found)
-
-
-def report(timing: LoopTiming) -> Timing:
-    """End a one-second window of a loop's timing, and return its percentiles."""
-    found = {}
-    for name, durations in (("wake", timing.wake), ("busy", timing.busy), ("period", timing.period)):
-        durations.turn_when_due()
-        found[name] = summary(durations.total)
-        found[f"recent_{name}"] = summary(durations.recent())
-    return Timing(**found)
+    def report(self) -> Timing:
+        """End a one-second window, and return all percentiles."""
+        found = {}
+        for name, durations in (("wake", self.wake), ("busy", self.busy), ("period", self.period)):
+            durations.turn_when_due()
+            found[name] = durations.total.summary()
+            found[f"recent_{name}"] = durations.recent().summary()
+        return Timing(**found)

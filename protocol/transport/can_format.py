@@ -30,6 +30,8 @@ MAX_NODE: Final = 127
 CLASSIC_BYTES: Final = 8
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 HEARTBEAT_S: Final = 0.1
+SILENT_S: Final = 0.5
+"""A peer from which nothing is received for this long, five heartbeats, is gone [s]."""
 
 _STATES: Final = list(PlantState)
 _CAUSES: Final = list(TripCause)
@@ -49,14 +51,6 @@ class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     channel: str = Field(default="239.74.163.2", description="the interface's: can0, /dev/ttyACM0, a multicast group…")
     node: int = Field(default=1, ge=1, le=MAX_NODE, description="number of the plant on the bus")
     fd: bool = Field(default=False, description="CAN FD, which frames of more than 8 bytes need")
-    short_counter: bool = Field(
-        default=False,
-        description="accept a counter that is too short to distinguish every late frame from a fresh one; a classic "
-        "CAN frame of 10-bit signals needs counter_bits = 4",
-    )
-    silent_s: float = Field(
-        default=0.5, ge=0.2, le=60, description="a peer from which nothing is received for this long is gone [s]"
-    )
     options: dict[str, Any] = Field(default={}, description="for the interface, such as bitrate = 1000000")
 
 
@@ -81,6 +75,11 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
             raise CanError(f"{problem}: lower {signals}{or_fd}")
 
 
+def counter_fills_frame(settings: CanSettings, wire: WireSpec) -> bool:
+    """Whether no longer counter fits into a measurement frame: six 10-bit codes leave 4 bits of a classic frame."""
+    return wire.measurement.bits == 8 * (FD_LENGTHS[-1] if settings.fd else CLASSIC_BYTES)
+
+
 def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
     """First seven bytes of SHA-256 over wire, period and lockstep, on which both ends must agree."""
     agreed = {"wire": wire.agreed(), "period_ns": period_ns, "lockstep": lockstep}
@@ -88,19 +87,12 @@ def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
 
 
 class Heartbeat(NamedTuple):
-    """State of one end, sent ten times a second and on a change.
+    """State of one end, sent ten times a second and on a change."""
 
-    Attributes:
-        state: Plant: its state. Controller: the state that it requests.
-        number: Plant: 0, or which of `TripCause` tripped it, from 1. Controller: number of the session, 0…15.
-        fingerprint: Of its wire, period and lockstep.
-        at_ns: When it was received, on `time.monotonic_ns()`; 0 in one that is sent.
-    """
-
-    state: PlantState
-    number: int
-    fingerprint: bytes
-    at_ns: int = 0
+    state: PlantState  # the plant's own; of the controller, the one that it requests
+    number: int  # plant: 0, or which of `TripCause` tripped it, from 1; controller: number of the session, 0…15
+    fingerprint: bytes  # of its wire, period and lockstep
+    at_ns: int = 0  # when it was received, on `time.monotonic_ns()`; 0 in one that is sent
 
     @property
     def cause(self) -> TripCause | None:

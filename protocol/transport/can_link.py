@@ -19,6 +19,7 @@ from aeroloop.protocol.transport.can_format import (
     HEARTBEAT_S,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
+    SILENT_S,
     CanError,
     CanSettings,
     Heartbeat,
@@ -39,18 +40,11 @@ End = Literal["plant", "controller"]
 
 
 class CanLink(Link):
-    """One end's frames and heartbeats on a bus. A thread of its own receives.
+    """One end's frames and heartbeats on a bus. A thread of its own receives. In lockstep an empty frame is silence.
 
-    In lockstep an empty frame may stand for a silent tick.
-
-    Attributes:
-        peer: The other end's last heartbeat, or None.
-        fault: Why the bus cannot be used, or None; `reopen` may clear it.
-        errors: Error frames, failed sends and receives so far.
-        refused: Malformed frames and heartbeats so far.
-
-    Raises:
-        CanError: The bus cannot be opened, or a frame does not fit it.
+    `peer` is the other end's last heartbeat, or None; `fault` says why the bus cannot be used, until `reopen` clears
+    it. `errors` counts error frames, failed sends and receives, `refused` malformed frames and heartbeats. Raises
+    CanError if the bus cannot be opened, or a frame does not fit it.
     """
 
     def __init__(
@@ -104,23 +98,19 @@ class CanLink(Link):
 
     @property
     def silent(self) -> bool:
-        """Whether the other end has been silent for longer than `can.silent_s`."""
-        return self.silent_s() > self._settings.silent_s
+        """Whether the other end has been silent for longer than `SILENT_S`."""
+        return self.silent_s() > SILENT_S
 
     def reopen(self) -> bool:
-        """Reopen the bus after a fault; whether that succeeded."""
+        """Reopen the bus after a fault, twice a second at the most; whether that succeeded."""
+        if time.monotonic() < self._reopen_due:
+            return False
+        self._reopen_due = time.monotonic() + _REOPEN_S
         self.close()
         with suppress(CanError):
             self._connect()
             return True
         return False
-
-    def mend(self) -> bool:
-        """As `reopen`, but twice a second at the most; False in between."""
-        if time.monotonic() < self._reopen_due:
-            return False
-        self._reopen_due = time.monotonic() + _REOPEN_S
-        return self.reopen()
 
     def close(self) -> None:
         """Stop receiving, and leave the bus."""

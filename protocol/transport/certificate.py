@@ -1,4 +1,4 @@
-"""Certificate of a role: reads one and checks this process's own before it is used.
+"""Certificate of a role: reads one, checks this process's own before it is used, and finds why links are refused.
 
 A host's directory has `ca.pem`, the certificate of the private authority, and for each role that runs there
 `ROLE.VEHICLE.pem` with `ROLE.VEHICLE.key`; `ROLE.pem` with `ROLE.key` where the certificate is good for every vehicle.
@@ -10,6 +10,9 @@ connecting side trusts every public authority besides `ca.pem`.
 
 from __future__ import annotations
 
+import socket
+import ssl
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,6 +21,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.endpoint import Endpoint
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -109,10 +113,7 @@ def read_certificate(file: Path) -> Certificate:
 def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) -> Certificate:
     """This process's own certificate, checked: of the first of some roles that has one in a directory.
 
-    Roles that will do are given the best one first; `vehicle` is None if any will do.
-
-    Raises:
-        CertificateError: There is none, or `check` refuses it.
+    The best role comes first; `vehicle` is None if any will do. Raises CertificateError if there is none that is good.
     """
     if not (directory / AUTHORITY).is_file():
         raise CertificateError(
@@ -133,13 +134,9 @@ def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) 
 
 
 def check(file: Path, role: str, vehicle: str | None) -> Certificate:
-    """Read a role's certificate and check that a process of this role and vehicle can use it, with its key, now.
+    """Read a role's certificate and check that a process of this role and vehicle (None: any) can use it now.
 
-    `vehicle` is None if any will do. The certificate's key and `ca.pem` are beside it.
-
-    Raises:
-        CertificateError: The key is missing, another one's or readable by others; the certificate is not issued by the
-            directory's authority, expired, not yet valid, or another role's or vehicle's.
+    Its key and `ca.pem` are beside it. Raises CertificateError.
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -190,3 +187,50 @@ def subject_field(certificate: x509.Certificate, field: Literal["CN", "OU"]) -> 
 
 def _utc(time: datetime) -> str:
     return f"{time:%Y-%m-%d %H:%M:%S} UTC"
+
+
+# ── why a link does not come about ──
+
+HANDSHAKE_S: Final = 0.5  # how long a command waits for a message of a handshake; usual is a millisecond
+PLAIN_S: Final = 3.0  # for a peer of Zenoh without TLS, which hangs up after 2 s; a halted process does not
+_EXPIRED: Final = "compare the clocks, or issue it anew with `aeroloop host keys issue`"
+_THEIRS: Final = {9: f"is not yet valid by this host's clock: {_EXPIRED}", 10: f"has expired: {_EXPIRED}"}  # x509_vfy.h
+_OURS: Final = {"EXPIRED": f"expired or not yet valid by its clock: {_EXPIRED}", "UNKNOWN_CA": "not of its authority"}
+
+
+def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -> str | None:
+    """One line about why a peer at an endpoint of TLS and a process with this certificate do not link.
+
+    None if nothing speaks against it, and where no process answers. Zenoh writes the reason only into its own log. TLS
+    1.3 shows a client at once what is wrong with the server's certificate, and in an alert, after the handshake, what
+    the server has against its own.
+    """
+    endpoint = Endpoint.parse(text)
+    if endpoint.protocol != "tls":
+        return None
+    authority = certificate.file.with_name(AUTHORITY)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # as Zenoh here: names of hosts do not matter
+    plain_text = f"{text} does not speak TLS: has its process a network.security.directory?"
+    link, begun = None, time.monotonic()
+    try:
+        context.load_verify_locations(authority)
+        context.load_cert_chain(certificate.file, certificate.key)
+        with socket.create_connection(endpoint.address, HANDSHAKE_S) as plain:
+            plain.settimeout(wait_s)
+            begun = time.monotonic()
+            with context.wrap_socket(plain) as link:
+                link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
+    except ssl.SSLCertVerificationError as error:
+        why = _THEIRS.get(error.verify_code, f"is not of this authority, {authority}")
+        return f"{text} is refused: its certificate {why}"
+    except (ssl.SSLEOFError, ConnectionError):  # at once: it ends, or nothing listens
+        return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
+    except ssl.SSLError as error:
+        alert = error.reason or ""
+        why = next((words for name, words in _OURS.items() if name in alert), alert.lower().replace("_", " "))
+        return f"{text} refuses the certificate {certificate.file}: {why}" if "ALERT" in alert else plain_text
+    except OSError:  # no answer in time; files that were just replaced
+        return None
+    return None

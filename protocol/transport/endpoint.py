@@ -1,9 +1,11 @@
-"""Endpoint of Zenoh, as text and as a socket of this host: `PROTOCOL/HOST:PORT`, and Zenoh's words after `?` or `#`."""
+"""Endpoint of Zenoh, `PROTOCOL/HOST:PORT` with Zenoh's words after `?` or `#`: as text, and as a socket to probe."""
 
 from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,7 +13,9 @@ from ipaddress import ip_address
 from typing import Final
 
 TLS: Final = ("tls", "quic")  # links are encrypted, both ends with a certificate
+STREAMS: Final = ("tcp", "tls")
 LOCAL: Final = ("unixsock-stream", "unixpipe", "shm")  # stays on this host; the file's mode says who may connect
+ACCEPT_S: Final = 0.25  # how long `accepting` waits for a connection
 _FORM: Final = re.compile(
     r"(?P<protocol>[a-z][a-z0-9_-]*)/(?P<host>\[[^]]*\]|[^:?#\s]+)(:(?P<port>\d+))?(?P<words>[?#]\S*)?"
 )
@@ -72,7 +76,7 @@ class Endpoint:
     @property
     def leaves_host(self) -> bool:
         """Whether it is one of TCP or TLS beyond loopback."""
-        return self.protocol in ("tcp", "tls") and not self.on_loopback
+        return self.protocol in STREAMS and not self.on_loopback
 
     @property
     def is_free(self) -> bool:
@@ -93,3 +97,18 @@ class Endpoint:
     def is_own(self) -> bool:
         """Whether its address is this host's."""
         return self.at_port(0).is_free
+
+
+def accepting(endpoints: Sequence[str]) -> list[str]:
+    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
+
+    def accepts(text: str) -> bool:
+        endpoint = Endpoint.parse(text)
+        if endpoint.protocol in STREAMS and endpoint.port is not None:
+            with suppress(OSError), socket.create_connection(endpoint.address, ACCEPT_S):
+                return True
+        return False
+
+    with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
+        found = pool.map(accepts, endpoints)
+        return [text for text, accepted in zip(endpoints, found, strict=True) if accepted]

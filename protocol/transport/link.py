@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Container
 from threading import Condition
 from typing import NamedTuple
 
@@ -105,7 +105,7 @@ class ZenohLink(Link):
                 self.refused += 1
 
         handler = Callback(receive, indirect=False)  # in Zenoh's thread: one of Python's would be one wake-up more
-        subscribers = [each.declare_subscriber(receive_key, handler) for each in sessions]
+        self._subscribers = [each.declare_subscriber(receive_key, handler) for each in sessions]
         self._publishers = [
             each.declare_publisher(
                 send_key,
@@ -116,8 +116,6 @@ class ZenohLink(Link):
             )
             for each in sessions
         ]
-        self._undeclare: list[Callable[[], None]] = [each.undeclare for each in subscribers]
-        self._undeclare += [each.undeclare for each in self._publishers]
 
     def send(self, frame: bytes) -> None:
         """Send a frame."""
@@ -126,5 +124,7 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         """Stop receiving."""
-        while self._undeclare:
-            self._undeclare.pop(0)()
+        while self._subscribers:
+            self._subscribers.pop().undeclare()
+        while self._publishers:
+            self._publishers.pop().undeclare()

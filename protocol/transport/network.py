@@ -1,6 +1,6 @@
 """Network: opens Zenoh's sessions of this process, peer to peer or at a router, without multicast.
 
-Every peer listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects to
+Every peer listens at the first free of `PORTS` consecutive ports from `network.rendezvous` on, and connects to
 all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
 end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
 
@@ -21,8 +21,8 @@ from typing import Any, Final
 
 import zenoh
 
-from aeroloop.protocol.transport.certificate import Certificate
-from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.certificate import Certificate, refusal
+from aeroloop.protocol.transport.endpoint import Endpoint, accepting
 from aeroloop.protocol.transport.network_settings import (
     READER,
     Identity,
@@ -31,7 +31,6 @@ from aeroloop.protocol.transport.network_settings import (
     Protected,
     protected,
 )
-from aeroloop.protocol.transport.probe import accepting, refusal
 from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, router_config, zenoh_config
 
 log: Final = logging.getLogger("aeroloop")
@@ -47,13 +46,8 @@ ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time withou
 def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
     """Open a session that meets the others at the rendezvous. The caller closes it.
 
-    `identity` is what the process is. `listen` is whether others can connect to it: yes for a role, no for a command
-    that only queries.
-
-    Raises:
-        NetworkError: A `listen` endpoint cannot be opened, a client's settings name no router, or links cannot be
-            secured as configured.
-        CertificateError: A certificate is needed, and this process has none that is good.
+    `listen` is whether others can connect to it: yes for a role, no for a command that only queries. Raises
+    NetworkError if an endpoint cannot be opened as configured, CertificateError for want of a good certificate.
     """
     network = protected(settings, identity)
     if listen:
@@ -130,9 +124,7 @@ def command_session(
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
-
-    Raises:
-        NetworkError: It is a client's, and no router answers; else as `join`.
+    Errors are those of `join`, and NetworkError if it is a client's and no router answers.
     """
     wait_ms = round(wait_s * 1000)
     network = protected(settings, identity)
@@ -175,7 +167,7 @@ class FrameSession:
 
     @property
     def wanted(self) -> bool:
-        """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
+        """Whether frames are to travel by datagrams."""
         return self._network.settings.mixed
 
     @property
@@ -215,12 +207,12 @@ class FrameSession:
 
     def _open(self, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
         """Open a session at these endpoints and no others, and without compression. Raises zenoh.ZError."""
-        settings = self._network.settings
-        lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS)
-        only: dict[str, Any] = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": []}
-        only |= {"gossip": False, "transport": "tcp", "lease_ms": lease_ms}
-        network = self._network._replace(settings=settings.model_copy(update=only))
-        return _open(zenoh_config(network, "peer", list(listen), list(connect)))
+        only = {"rendezvous": [*listen, *connect], "listen": [], "connect": [], "transport": "tcp"}
+        network = self._network._replace(settings=self._network.settings.model_copy(update=only))
+        config = zenoh_config(network, "peer", list(listen), list(connect))
+        config["scouting"]["gossip"]["enabled"] = False
+        config["transport"]["link"]["tx"]["lease"] = PATIENT_LEASE_MS
+        return _open(config)
 
 
 def _datagram_endpoints(settings: NetworkSettings) -> list[str]:

@@ -1,8 +1,8 @@
 """Network settings: where a process meets the others, and which of its links become mutual TLS.
 
-An endpoint of TCP on another host than this becomes one of TLS; on loopback it stays as it is, unless
-`network.loopback_secured`. A process uses the certificate of its role and vehicle, to connect and to listen. Names of
-hosts do not matter: what a peer may do follows from its certificate's common name alone.
+An endpoint of TCP beyond loopback becomes one of TLS; on loopback it stays as it is, so `tls/127.0.0.1:7447` is mutual
+TLS on this host, too. A process uses the certificate of its role and vehicle, to connect and to listen. Names of hosts
+do not matter: what a peer may do follows from its certificate's common name alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.topics import NAME
 from aeroloop.protocol.transport.certificate import Certificate, own_certificate
-from aeroloop.protocol.transport.endpoint import LOCAL, TLS, Endpoint
+from aeroloop.protocol.transport.endpoint import TLS, Endpoint
+
+PORTS: Final = 8
+"""Consecutive ports from each rendezvous' port on that processes meet at: one that hangs keeps nobody out."""
 
 
 class NetworkError(AeroloopError):
@@ -63,41 +66,21 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     )
     rendezvous: list[EndpointText] = Field(
         default=["tcp/127.0.0.1:7447"],
-        description="Zenoh endpoints where processes meet, one for each host; a process listens at its own host's and "
-        "connects to all; [] for none",
-    )
-    ports: int = Field(
-        default=8,
-        ge=1,
-        le=64,
-        description="consecutive ports from each rendezvous' port on that processes meet at: any of them can be joined",
+        description="Zenoh endpoints where processes meet, one for each host; a process listens at the first free "
+        "one of 8 ports of its own host's and connects to all; tls/… is mutual TLS on loopback, too; [] for none",
     )
     listen: list[EndpointText] = Field(
-        default=[],
-        description="further Zenoh endpoints this process can be reached at; port 0 is any free one",
+        default=[], description="further endpoints this process can be reached at; port 0 is any free one"
     )
     connect: list[EndpointText] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
-    gossip: bool = Field(
-        default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
-    )
     transport: Literal["mixed", "tcp"] = Field(
         default="mixed",
         description="of the loop's frames beyond loopback, in real time; mixed: datagrams by QUIC, over UDP at the "
         "same ports, and what stays on TCP or TLS is compressed; tcp: the same links as everything else",
     )
-    lease_ms: int = Field(
-        default=1000,
-        ge=100,
-        le=60_000,
-        description="a silent peer is disconnected after this, or 10 s if longer where `transport` is mixed [ms]",
-    )
     security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
     insecure: bool = Field(
-        default=False,
-        description="allow plain text beyond loopback: anyone on that network can then drive the vehicle",
-    )
-    loopback_secured: bool = Field(
-        default=False, description="mutual TLS on loopback, too: the users of this host need certificates, as others do"
+        default=False, description="allow plain text beyond loopback: anyone there can then drive the vehicle"
     )
 
     @field_validator("rendezvous", mode="before")
@@ -110,7 +93,7 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         """Every endpoint at which a process may be met: the rendezvous, port by port; by a client, the routers."""
         if self.mode == "client":
             return self.rendezvous
-        return [str(each) for first in self.rendezvous for each in Endpoint.parse(first).ports(self.ports)]
+        return [str(each) for first in self.rendezvous for each in Endpoint.parse(first).ports(PORTS)]
 
     @property
     def endpoints(self) -> list[str]:
@@ -168,16 +151,15 @@ def protected(settings: NetworkSettings, identity: Identity) -> Protected:
 def opened(text: str, settings: NetworkSettings) -> str:
     """The endpoint that is opened in place of a configured one. Raises NetworkError."""
     endpoint = Endpoint.parse(text)
-    must = endpoint.is_plain or (settings.loopback_secured and endpoint.protocol not in (*TLS, *LOCAL))
     if settings.security.directory:
-        if must and endpoint.protocol != "tcp":
+        if endpoint.is_plain and endpoint.protocol != "tcp":
             raise NetworkError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
-        return str(replace(endpoint, protocol="tls")) if must else text
-    if endpoint.protocol in TLS or (must and settings.loopback_secured):
+        return str(replace(endpoint, protocol="tls")) if endpoint.is_plain else text
+    if endpoint.protocol in TLS:
         raise NetworkError(
             f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
         )
-    if must and not settings.insecure:
+    if endpoint.is_plain and not settings.insecure:
         raise NetworkError(
             f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
             "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"

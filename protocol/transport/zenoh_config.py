@@ -3,7 +3,7 @@
 Zenoh checks every message of a link, both ways, by the common name of the peer's certificate, whichever end connected.
 What no rule allows is dropped without a sign; so are messages of and to a peer of another vehicle, or of no role. The
 rules are the table of topics: which messages a session takes from each peer and sends to it. A role's own name stands
-in the keys it sends on. A plain link on loopback is unrestricted unless it is to be secured, too. A router has the same
+in the keys it sends on. A plain link on loopback is unrestricted. A router has the same
 rules, and every end lets a router pass what it has checked.
 
 A rule's key must include the message's. So readers may name all vehicles in one key (`aeroloop/*/status/*`), which
@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ACTIONS, TOPICS, Action, Topic
 from aeroloop.protocol.transport.certificate import AUTHORITY, OF_ONE_VEHICLE, ROLES, ROUTER, Certificate, common_name
-from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.endpoint import TLS, Endpoint
 from aeroloop.protocol.transport.history import PAGE_BYTES
 from aeroloop.protocol.transport.network_settings import Protected
 
@@ -31,8 +31,10 @@ QUEUE: Final = 16  # batches that may wait to be sent on a link, per priority; t
 _QUEUES: Final = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low")
 HEADER_BYTES: Final = 65_536  # more than Zenoh adds to a payload: the key, and what goes with it
 HANDSHAKE_MS: Final = 2000  # time-out of the handshake with a program that accepts a connection and sends nothing
+LEASE_MS: Final = 1000
+"""A silent peer is disconnected after this [ms]."""
 PATIENT_LEASE_MS: Final = 10_000
-"""Least lease where frames have a transport of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
+"""The same where frames have a session of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
 RETRY_MS: Final = (50, 1000)  # first and longest pause between two attempts to connect to an endpoint
 
 
@@ -71,7 +73,7 @@ def zenoh_config(
             for key, answer, request in limits
             for messages, most in ((["put", "reply"], answer), (["query"], request))
         ],
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
         "transport": {
             # No use for frames of seven bytes, and a killed process leaves its files behind.
             "shared_memory": {"enabled": False},
@@ -79,7 +81,7 @@ def zenoh_config(
             # Late frames do no harm: the receiver refuses them by their tick.
             "link": {
                 "tx": {
-                    "lease": max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms,
+                    "lease": PATIENT_LEASE_MS if settings.mixed else LEASE_MS,
                     "queue": {"size": dict.fromkeys((*_QUEUES, "background"), QUEUE)},
                 },
                 "rx": {"max_message_size": topics.POINTS_BYTES + HEADER_BYTES},  # of fragments: 1 GiB by default
@@ -99,10 +101,9 @@ def zenoh_config(
     if certificate is not None:
         config["transport"]["link"]["tls"] = tls_config(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
-        config["transport"]["link"]["protocols"] = sorted(
-            {Endpoint.parse(each).protocol for each in settings.endpoints}
-        )
-        config["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
+        protocols = {Endpoint.parse(each).protocol for each in settings.endpoints}
+        config["transport"]["link"]["protocols"] = sorted(protocols)
+        config["access_control"] = access_control(*vehicles, loopback=not protocols <= {*TLS})
     return config
 
 

@@ -79,12 +79,9 @@ def level(quantizer: Quantizer, code: ca.SX) -> ca.SX:
 
 
 def encode(quantizer: Quantizer, y: ca.SX, held: ca.SX) -> ca.SX:
-    """The code of a value, as `Quantizer.encode`. Build it `as_written`. Shape (1,).
+    """The code of a value, as `Quantizer.encode`; not of NaN. Build it `as_written`. Shape (1,).
 
-    Args:
-        quantizer: Its parameters; not its memory.
-        y: The value; not NaN, which has no code.
-        held: The last code, for a quantizer with a memory; NaN before the first.
+    Of the quantizer it takes the parameters alone: its memory is `held`, the last code; NaN before the first.
     """
     if isinstance(quantizer, Continuous):
         return ca.fmax(-quantizer.limit, ca.fmin(quantizer.limit, y))

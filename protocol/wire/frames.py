@@ -19,17 +19,13 @@ from bitstruct.c import compile as compile_bits
 
 MIN_COUNTER_BITS: Final = 4
 MAX_COUNTER_BITS: Final = 16
-DEFAULT_COUNTER_BITS: Final = 8
 
 
 class FrameFormat:
     """One kind of frame: a counter of 4…16 bits, and a code for each of `widths` [bit]; None is a float64.
 
-    Attributes:
-        counters: Number of counter values; the counter runs 0…counters − 1 and wraps.
-        bits: Bits of counter and codes, without padding.
-        first_bit: Offset of the first code [bit].
-        size: Bytes of a frame, padding included.
+    The counter runs 0…`counters` − 1 and wraps. `bits` are those of counter and codes, `first_bit` is the offset of the
+    first code, and `size` the bytes of a frame, padding included.
     """
 
     def __init__(self, widths: Sequence[int | None], counter_bits: int) -> None:
@@ -50,11 +46,7 @@ class FrameFormat:
         self._padding = [(byte, mask) for byte, mask in masks if mask]
 
     def pack(self, counter: int, codes: Sequence[float]) -> bytes:
-        """Bytes of a frame.
-
-        Args:
-            counter: 0…counters − 1.
-            codes: One per signal: ints within R-bit two's complement, or floats where the signal is not quantized.
+        """Bytes of a frame. Codes are ints within R-bit two's complement, or floats where nothing is quantized.
 
         Raises:
             ValueError: A counter or code that does not fit, a wrong number of codes, an infinite float.
@@ -102,14 +94,8 @@ class TickCounter:
     clock that runs 1 % fast, so that the mark follows either clock and still recovers from a mark that is too early. A
     stream that is late as a whole becomes the grid at the same pace.
 
-    Args:
-        period_ns: Period of the plant's grid [ns].
-        counters: Number of counter values.
-        lockstep: Whether no tick is ever skipped; then the counter alone gives the tick.
-        tick: Tick of the last measurement before the first one given; −1 at a session's start.
-
-    Attributes:
-        tick: Tick of the last measurement that was newer than all before it.
+    In lockstep no tick is ever skipped, and the counter alone gives the tick. `tick` is that of the last measurement
+    that was newer than all before it; −1 at a session's start.
     """
 
     DRIFT: Final = 50

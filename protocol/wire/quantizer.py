@@ -22,33 +22,20 @@ from typing import Final
 
 MIN_BITS: Final = 2
 MAX_BITS: Final = 16
-
-MIN_LOGARITHMIC_BITS: Final = 3
-"""With 2 bits there is one interval, which cannot be geometric and uniform."""
-
+MIN_LOGARITHMIC_BITS: Final = 3  # with 2 bits there is one interval, which cannot be geometric and uniform
 TIE: Final[float] = 1 - 2.0**-50
 """A value within a few units in the last place of an interval's edge lies on the edge: dividing by l rounds."""
-
 SLACK: Final[float] = 1 - TIE
-
-_ALIKE: Final = 1 - 2.0**-30
-"""Tolerance of the last geometric interval against l: where the two are equal, rounding must not choose m."""
-
-_APART: Final = 2.0**-46
-"""Least distance of two edges, relative: more than what counts as a tie."""
+_ALIKE: Final = 1 - 2.0**-30  # where the last geometric interval is l, rounding must not choose m
+_APART: Final = 2.0**-46  # least relative distance of two edges: more than what counts as a tie
 
 
 class Quantizer(ABC):
     """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) requires.
 
-    `level` has no memory; encoding may depend on the last code, so each scalar has a quantizer of its own.
-
-    Attributes:
-        limit: Edge of the range, in the signal's unit.
-        bound: δ_y of (C.13), in the signal's unit.
-        saturated: Number of values beyond the range, which got the outermost level.
-        outermost: The largest level, where saturation begins [signal's unit].
-        invalid: The code of "no valid value".
+    `level` has no memory; encoding may depend on the last code, so each scalar has a quantizer of its own. `bound` is
+    δ_y of (C.13), `limit` the edge of the range and `outermost` the largest level [signal's unit]; `saturated` counts
+    values beyond the range, and `invalid` is the code of "no valid value".
     """
 
     bound: float
@@ -63,11 +50,7 @@ class Quantizer(ABC):
 
     @abstractmethod
     def encode(self, y: float) -> float:
-        """The code of a value. Beyond the range: the outermost level's, and `saturated` goes up.
-
-        Raises:
-            ValueError: y is NaN. The caller sends `invalid` for a failed sensor.
-        """
+        """The code of a value; beyond the range the outermost level's. Raises ValueError for NaN: send `invalid`."""
 
     @abstractmethod
     def level(self, code: float) -> float:
@@ -94,7 +77,7 @@ class Continuous(Quantizer):
         self.invalid = nan
 
     def encode(self, y: float) -> float:
-        """The value itself, within ±limit; see `Quantizer.encode`."""
+        """See `Quantizer.encode`."""
         if -self.limit <= y <= self.limit:
             return y
         _refuse_nan(y)
@@ -102,24 +85,16 @@ class Continuous(Quantizer):
         return copysign(self.limit, y)
 
     def level(self, code: float) -> float:
-        """The value itself."""
+        """See `Quantizer.level`."""
         return float(code)
 
 
 class CodedQuantizer(Quantizer):
     """A quantizer with R-bit codes and a table of levels, symmetric about 0; kinds differ in levels and in `encode`.
 
-    Args:
-        bits: R, 2…16.
-        limit: Edge of the range [signal's unit], > 0.
-
-    Attributes:
-        top: N = 2^(R−1) − 1, the code of the outermost level.
-        deadzone: y₀, the largest magnitude that is quantized to 0 by its value alone [signal's unit].
-        levels: Level by code. Python's negative index is two's complement, so `levels[code]` is the whole decoder.
-
-    Raises:
-        ValueError: A value out of bounds.
+    `bits` is R, 2…16; `top` is N = 2^(R−1) − 1, the code of the outermost level; `deadzone` is y₀, the largest
+    magnitude that is quantized to 0 by its value alone. Python's negative index is two's complement: `levels[code]`
+    decodes. A parameter out of bounds is a ValueError; all but `bits` have the signal's unit.
     """
 
     deadzone: float
@@ -140,7 +115,7 @@ class CodedQuantizer(Quantizer):
         self.outermost = self.levels[self.top]
 
     def level(self, code: float) -> float:
-        """The level of a code; see `Quantizer.level`."""
+        """See `Quantizer.level`."""
         if not (isinstance(code, int) and self.invalid <= code <= self.top):
             raise ValueError(f"{code!r} is not a code of {self.bits} bits")
         return self.levels[code]
@@ -151,18 +126,7 @@ class UniformQuantizer(CodedQuantizer):
 
     With y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). The paper gives this l and says only y₀ > 0; l/2 is
     inferred: with it, 2^R − 1 intervals of that length fill the range exactly. For any other y₀ the step is such that
-    the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
-
-    Args:
-        bits: R, 2…16.
-        limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀ [signal's unit]; l/2 if None.
-
-    Attributes:
-        step: l, the length of an interval [signal's unit].
-
-    Raises:
-        ValueError: A value out of bounds.
+    the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1). `step` is l.
     """
 
     def __init__(self, bits: int, limit: float, deadzone: float | None = None) -> None:
@@ -181,7 +145,7 @@ class UniformQuantizer(CodedQuantizer):
         self._tabulate([self.deadzone + self.step / 2 + i * self.step for i in range(self.top)])
 
     def encode(self, y: float) -> int:
-        """The code of a value; see `Quantizer.encode`."""
+        """See `Quantizer.encode`."""
         x: float = (abs(y) - self.deadzone) / self.step * TIE
         if x <= 0.0:
             return 0
@@ -202,14 +166,7 @@ class HysteresisQuantizer(UniformQuantizer):
         held level   0                  ±y_i
         stays while  |y| ≤ y₀ + h       y_i − l/2 − h ≤ ±y ≤ y_i + l/2 + h
 
-    Args:
-        bits: R, 2…16.
-        limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀ [signal's unit]; l/2 if None.
-        hysteresis: h [signal's unit]; l/2 if None: a code changes once the value is more than a step from its level.
-
-    Raises:
-        ValueError: A value out of bounds.
+    With h = l/2, the default, a code changes once the value is more than a step from its level.
     """
 
     def __init__(self, bits: int, limit: float, deadzone: float | None = None, hysteresis: float | None = None) -> None:
@@ -221,7 +178,7 @@ class HysteresisQuantizer(UniformQuantizer):
         self.reset()
 
     def encode(self, y: float) -> int:
-        """The code of a value, given the held code; see `Quantizer.encode`."""
+        """See `Quantizer.encode`."""
         if self._low <= y <= self._high:
             return self._held
         code = super().encode(y)
@@ -229,12 +186,12 @@ class HysteresisQuantizer(UniformQuantizer):
         return code
 
     def reset(self) -> None:
-        """Hold nothing: the next value is quantized uniformly."""
+        """See `Quantizer.reset`."""
         self._held = 0
         self._low, self._high = inf, -inf
 
     def resume(self, code: float) -> None:
-        """Hold the level of a code; see `Quantizer.resume`."""
+        """See `Quantizer.resume`."""
         if code != self.invalid:
             self._hold(int(code))
 
@@ -261,22 +218,9 @@ class LogarithmicQuantizer(CodedQuantizer):
         edge   e₀ = y₀   e_i = y₀·(y_t/y₀)^(i/m)   e_m = y_t   e_i = y_t + (i − m)·l   e_N = limit
         code      0     |         1 … m                |         m + 1 … N
 
-    m is the least number for which no geometric interval is longer than l. A level is the middle of its interval. A
-    tie goes towards zero.
-
-    Args:
-        bits: R, 3…16.
-        limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀ [signal's unit]; if None a quarter of the uniform quantizer's, limit / (2^R − 1) / 4.
-        threshold: y_t, where the intervals stop growing [signal's unit], at most limit/2; limit/4 if None.
-
-    Attributes:
-        growing: m, the number of geometric intervals on either side.
-        step: l, the length of the uniform intervals [signal's unit].
-        edges: e₀ … e_N [signal's unit].
-
-    Raises:
-        ValueError: A value out of bounds.
+    m, `growing`, is the least number for which no geometric interval is longer than l, `step`. A level is the middle
+    of its interval. A tie goes towards zero. By default y_t, `threshold`, is limit/4, and y₀ a quarter of the uniform
+    kind's.
     """
 
     def __init__(self, bits: int, limit: float, deadzone: float | None = None, threshold: float | None = None) -> None:
@@ -301,7 +245,7 @@ class LogarithmicQuantizer(CodedQuantizer):
         self._tabulate([(a + b) / 2 for a, b in pairwise(self.edges)])
 
     def encode(self, y: float) -> int:
-        """The code of a value; see `Quantizer.encode`."""
+        """See `Quantizer.encode`."""
         _refuse_nan(y)
         i = bisect_left(self.edges, abs(y) * TIE)
         if i > self.top:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS, MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
+from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
 from aeroloop.protocol.wire.quantizer import (
     MAX_BITS,
     MIN_BITS,
@@ -27,14 +27,8 @@ MAX_ACTUATORS: Final = 8
 
 WATCHDOG_S: Final = 0.1
 """0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
-
 FIRST_COMMAND_S: Final = 1.0
 """How long a granted claim may wait for its first command [s]."""
-
-
-def bits_or_continuous(value: object) -> object:
-    """The word "cont" stands for no quantization in configuration (TOML has no null)."""
-    return None if value == "cont" else value
 
 
 class SignalBits(NamedTuple):
@@ -48,8 +42,7 @@ class SignalBits(NamedTuple):
     def parse(cls, text: str) -> SignalBits:
         """Of three numbers, such as 10/6/6; of two, out and in as in the paper's tables, such as 8/6; of `cont`.
 
-        Raises:
-            ValueError: It is none of these, or a number is out of range.
+        Raises ValueError if it is none of these, or a number is out of range.
         """
         words = ["cont"] * 3 if text == "cont" else text.split("/")
         good = all(word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words)
@@ -68,11 +61,13 @@ class SignalBits(NamedTuple):
 
 _Number: TypeAlias = Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)]
 Bits: TypeAlias = Annotated[
-    _Number | None, BeforeValidator(bits_or_continuous, json_schema_input_type=_Number | Literal["cont"] | None)
+    _Number | None,
+    BeforeValidator(
+        lambda value: None if value == "cont" else value, json_schema_input_type=_Number | Literal["cont"] | None
+    ),
 ]
-
+"""TOML has no null: the word "cont" stands for no quantization in configuration."""
 Positive: TypeAlias = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
 Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
 
 _OWNER: Final[dict[str, Kind]] = {"hysteresis": "hysteresis-uniform", "threshold": "logarithmic-uniform"}
@@ -85,18 +80,13 @@ class SignalSpec(BaseModel, frozen=True, extra="forbid"):
     bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
     limit: Positive = Field(description="edge of the range [signal's unit]")
     deadzone: Positive | None = Field(
-        default=None,
-        description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
+        default=None, description="y0 of (C.14) [signal's unit]; half a step if left out, less if logarithmic-uniform"
     )
     kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
     hysteresis: Positive | None = Field(
-        default=None,
-        description="h: widens a held level's interval [signal's unit]; half a step if left out; hysteresis-uniform",
+        default=None, description="hysteresis-uniform: h, widens a held interval [signal's unit]; half a step"
     )
-    threshold: Positive | None = Field(
-        default=None,
-        description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
-    )
+    threshold: Positive | None = Field(default=None, description="logarithmic-uniform: y_t [signal's unit]; limit/4")
 
     @model_validator(mode="after")
     def _makes_a_quantizer(self) -> SignalSpec:
@@ -133,19 +123,14 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
     attitude: SignalSpec = Field(
         default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
     )
-    rate: SignalSpec = Field(
-        default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
-    )
+    rate: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ω, body frame [rad/s]")
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
     actuators: int = Field(
-        default=2,
-        ge=1,
-        le=MAX_ACTUATORS,
-        description="number of motors: 2 for the Aero's u₂ and u₃, n for u₁…uₙ of any other plant",
+        default=2, ge=1, le=MAX_ACTUATORS, description="number of motors: 2 for the Aero's u₂ and u₃, n for u₁…uₙ"
     )
     transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
     counter_bits: int = Field(
-        default=DEFAULT_COUNTER_BITS,
+        default=8,
         ge=MIN_COUNTER_BITS,
         le=MAX_COUNTER_BITS,
         description="bits of the counter in each frame; a frame 2^bits periods late may be taken for a newer one",
@@ -177,26 +162,14 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         return period_ns << self.counter_bits
 
     def with_bits(self, text: str) -> WireSpec:
-        """The same spec with other bits, as of `SignalBits.parse`: 10/6/6, 8/6, cont.
-
-        Raises:
-            ValueError: The text has no bits, or they do not fit a signal's kind or its other parameters.
-        """
-        bits = SignalBits.parse(text)
-        return WireSpec(
-            attitude=self.attitude.with_bits(bits.attitude),
-            rate=self.rate.with_bits(bits.rate),
-            voltage=self.voltage.with_bits(bits.voltage),
-            actuators=self.actuators,
-            transmit=self.transmit,
-            counter_bits=self.counter_bits,
-        )
+        """The same spec with other bits, as of `SignalBits.parse`. Raises ValueError."""
+        signals = {name: getattr(self, name).with_bits(bits) for name, bits in SignalBits.parse(text)._asdict().items()}
+        return WireSpec(**{name: getattr(self, name) for name in WireSpec.model_fields} | signals)
 
     def agreed(self) -> dict[str, Any]:
-        """The spec as JSON, for claims and fingerprints.
+        """The spec as JSON, for claims and fingerprints, without what is not in use.
 
-        Leaves out what is not in use, so that an end without it can read the rest: parameters of other kinds in a
-        uniform signal, and `transmit` if all of it is by default.
+        That is parameters of other kinds in a uniform signal, and `transmit` if all of it is by default.
         """
         tree = self.model_dump(mode="json")
         for name in ("attitude", "rate", "voltage"):
@@ -231,14 +204,10 @@ class LoopSettings(BaseModel, extra="forbid"):
 
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
-        description="request SCHED_FIFO, locked memory, affinity, and CPUs that stay awake; strict: refuse to run "
-        "without the first three; off: request none",
+        description="request SCHED_FIFO, locked memory, affinity, CPUs that stay awake; strict: refuse to run without "
+        "the first three; off: request none",
     )
-    priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
-    trace_s: float = Field(
-        default=0.1, ge=0.01, le=10, description="time between batches of the trace, which the log records [s]"
-    )
 
     @property
     def period_ns(self) -> int:

@@ -32,15 +32,9 @@ def parts(memory: Buffer, sizes: Mapping[str, int]) -> dict[str, Buffer]:
 class Compiled:
     """A function whose named inputs and outputs are rows of doubles in memory.
 
-    Write into `inputs[name]`, call the object, read `outputs[name]`. Nothing is allocated by a call.
-
-    Args:
-        function: The function; all its inputs and outputs must be dense and named.
-        shared: Buffers to use instead of new ones, by the name of an input or output.
-
-    Attributes:
-        evaluate: What a call of the object does, without a Python function in between, for the loop. It does not keep
-            the object alive, whose memory it uses.
+    Write into `inputs[name]`, call `evaluate`, read `outputs[name]`. Nothing is allocated by a call. All inputs and
+    outputs must be dense and named; `shared` are buffers to use instead of new ones, by name. `evaluate` does not keep
+    the object alive, whose memory it uses.
 
     Raises:
         ValueError: A shared buffer differs in size from its input or output.

@@ -1,9 +1,8 @@
 """Transmit policy: sends a frame every tick, or only when a level changes (Remark 3), with a heartbeat.
 
-Quantized values change in steps, so a frame equal to the last one need not be sent: the receiver holds the last levels,
-and nothing is lost. A heartbeat, after less than half the counter's range, is the sender's sign of life and keeps its
-counter unambiguous. In lockstep each frame is waited for, so silence cannot be received: an empty frame, `UNCHANGED`,
-stands for it.
+Quantized values change in steps, so a frame equal to the last one need not be sent: the receiver holds the last
+levels. A heartbeat, after less than half the counter's range, is the sender's sign of life and keeps its counter
+unambiguous. In lockstep each frame is waited for: an empty frame, `UNCHANGED`, stands for one that is not sent.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, Field, model_validator
 
 UNCHANGED: Final = b""
-"""Empty frame: stands for a frame that is not sent because it equals the last one."""
-
 Policy = Literal["periodic", "on_change"]
 
 

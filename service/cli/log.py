@@ -157,8 +157,6 @@ def replay(
     end: Annotated[
         Literal["controller", "plant"] | None, typer.Option("--end", help="Only this end; both if left out.")
     ] = None,
-    since_s: Since = -inf,
-    until_s: Until = inf,
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
@@ -166,9 +164,8 @@ def replay(
     from aeroloop.service.logs.replay import replay
     from aeroloop.service.terminal.log_sheets import replay_sheets
 
-    _check_part(since_s, until_s)
     with working("replaying", json, 1) as update:
-        replayed = replay(logs, overrides or [], update, [end] if end else ENDS, since_s, until_s)
+        replayed = replay(logs, overrides or [], update, [end] if end else ENDS)
     show(replayed, json, replay_sheets)
     if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)

@@ -82,8 +82,8 @@ def controller(
         from aeroloop.service.theorem.certificate import described_certificate
 
         daemon = Daemon(role, settings)
-        role.own_versions = version_of(settings.law)
-        role.publish_description(settings.description(), described_certificate(settings))
+        law = version_of(settings.law)
+        role.publish_description(settings.description(), described_certificate(settings), law)
         daemon.run()
 
     run_role("controller", settings, run)

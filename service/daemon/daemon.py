@@ -15,7 +15,6 @@ from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
 from aeroloop.protocol.messages.trace import batches_per_s
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
-from aeroloop.protocol.runtime.timing import report, summary
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
@@ -161,8 +160,8 @@ class Daemon:
                 refused=refused,
                 stale=counts.stale,
                 saturated=counts.saturated + (session.controller.saturated if session else 0),
-                age_us=summary(shared.age.recent()),
-                timing=report(shared.timing) if shared.timing else None,
+                age_us=shared.age.recent().summary(),
+                timing=shared.timing.report() if shared.timing else None,
                 notes=self._notes,
                 lacks_recorder=self._lacks_recorder(),
                 gains=record.gains,

@@ -65,7 +65,7 @@ class Shared:
         self.claims = ClaimClient(role, loop, wire, auto_arm=settings.controller.auto_arm)
         self.machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self.cause = ""  # why the last session ended
-        self.trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
+        self.trace = TraceWriter("controller", wire, secrets.randbits(64))
         self.changes = OperatorChanges(role, settings, self.trace, why_none)
         self.plant = PlantStatus(role)
         self.watch = LawWatch(role, f"law {settings.law.kind}")

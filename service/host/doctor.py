@@ -17,11 +17,10 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
-from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
-from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
-from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.network_settings import NetworkSettings, opened
-from aeroloop.protocol.transport.probe import PLAIN_S, accepting, refusal
+from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid
+from aeroloop.protocol.transport.certificate import PLAIN_S, SOON_DAYS, CertificateError, read_certificate, refusal
+from aeroloop.protocol.transport.endpoint import Endpoint, accepting
+from aeroloop.protocol.transport.network_settings import PORTS, NetworkSettings, opened
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host.health import LATE_SHARE
 
@@ -89,7 +88,7 @@ def diagnose(
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
         timing.done()
-    wake = summary(timing.wake.total)
+    wake = timing.wake.total.summary()
     limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
     late = wake is None or wake.p99 > limit_us
     trial = Finding(
@@ -136,7 +135,7 @@ def network_findings(network: NetworkSettings) -> Iterator[Finding]:
     usable = [read_certificate(folder / row.file) for row in rows if folder and row.problem is None]
     for text in [*network.rendezvous, *network.connect]:
         place, several = opened(text, network), network.mode == "peer" and text in network.rendezvous
-        answering = accepting([str(each) for each in Endpoint.parse(place).ports(network.ports if several else 1)])
+        answering = accepting([str(each) for each in Endpoint.parse(place).ports(PORTS if several else 1)])
         tries = [(port, certificate) for port in answering for certificate in usable]
         with ThreadPoolExecutor(max(1, len(tries))) as pool:
             lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))

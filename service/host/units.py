@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.runtime.realtime import PRIORITY
 from aeroloop.service.config import Settings
 
 CONFIG: Final = Path("/etc/aeroloop/aeroloop.toml")
@@ -99,14 +100,13 @@ def unit(name: str, source: Source) -> str:
         configured = source.settings.plant.state_directory
         rights.append(f"ReadWritePaths={_quoted(str(configured))}" if configured else "StateDirectory=aeroloop")
     if name == "recorder":
-        words += ["--set", "recorder.directory=%L/aeroloop"]
+        words += ["--set", "recorder.path=%L/aeroloop"]
         rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
     elif name == "router":
         rights.append("CapabilityBoundingSet=")
     else:
-        priority = source.settings.loop.priority
         rights += [
-            f"LimitRTPRIO={priority}",
+            f"LimitRTPRIO={PRIORITY}",
             "LimitMEMLOCK=infinity",
             "CapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK",
         ]

@@ -53,7 +53,7 @@ def run_demo(
         HilError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be reviewed.
     """
-    path = log_path(log or settings.recorder.directory, "demo-%Y%m%d-%H%M%S-%f.mcap")
+    path = log_path(log or settings.recorder.path, "demo-%Y%m%d-%H%M%S-%f.mcap")
     settings = standalone(settings, path, duration_s=duration_s)
     interrupted = threading.Event()
     show = show or (lambda *_: None)

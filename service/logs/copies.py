@@ -6,10 +6,10 @@ once: schemas, channels, attachments, and a metadata record that equals the last
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, Damage, NotMcapError, records
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, NotMcapError, records
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 
@@ -38,14 +38,6 @@ class Recovery(BaseModel, frozen=True):
     lost: list[str] = Field(description="what could not be read, a line each; empty if the file was whole")
 
 
-class Copied(NamedTuple):
-    """How many messages were written, their topics, and what of each file could not be read."""
-
-    messages: int
-    topics: list[str]
-    damages: list[tuple[Path, Damage]]
-
-
 def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
     """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
 
@@ -56,15 +48,14 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
     try:
         broken.stat()
         with writing(out, [broken], force=force) as part:
-            copied = _copy([broken], part, "aeroloop log recover", progress)
-            if not copied.messages:
+            messages, names, lost = _copy([broken], part, "aeroloop log recover", progress)
+            if not messages:
                 raise RecoverError(f"{broken} holds no whole message")
     except NotMcapError as error:
         raise RecoverError(f"{error}, so there is nothing to recover") from None
     except OSError as error:
         raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
-    lost = [str(damage) for _, damage in copied.damages]
-    return Recovery(out=str(out), messages=copied.messages, channels=len(copied.topics), lost=lost)
+    return Recovery(out=str(out), messages=messages, channels=len(names), lost=lost)
 
 
 def write_decoded(
@@ -83,43 +74,44 @@ def write_decoded(
     decoder = Decoder(rate_hz=None)
     for description in recording.descriptions.values():
         decoder.configure(description)
-    copied = _copy(recording.paths, out, "aeroloop log export", progress, decoder)
-    damages = [f"{path}: {damage.what}" for path, damage in copied.damages]
-    if decoder.malformed:
-        damages.append(f"malformed: {decoder.malformed} of what is decoded")
-    return copied.messages, copied.topics, damages
+    messages, names, _ = _copy(recording.paths, out, "aeroloop log export", progress, decoder)
+    malformed = [f"malformed: {decoder.malformed} of what is decoded"] if decoder.malformed else []
+    return messages, names, [*recording.damaged, *malformed]
 
 
 def _copy(
     paths: Sequence[Path], out: Path, program: str, progress: Progress | None, decoder: Decoder | None = None
-) -> Copied:
+) -> tuple[int, list[str], list[str]]:
     """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
+
+    Returns:
+        How many messages were written, their topics, and what could not be read, a line each.
 
     Raises:
         NotMcapError: A file is not an MCAP file.
         OSError: A file cannot be read, or the new one cannot be written.
     """
-    messages, damages, done = 0, list[tuple[Path, Damage]](), 0
-    size = max(1, sum(path.stat().st_size for path in paths))
-    names, attachments, last = set[str](), set[tuple[str, bytes]](), dict[tuple[str, str | None], dict[str, str]]()
+    messages, done, size = 0, 0, max(1, sum(path.stat().st_size for path in paths))
+    names, damages = set[str](), list[str]()
+    attachments, last = set[tuple[str, bytes]](), dict[tuple[str, str | None], dict[str, str]]()
     with out.open("wb") as file:
         writer = Writer(file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         writer.start(profile="aeroloop", library=program)
         schema_id = cache(writer.register_schema)
 
         @cache
-        def channel_id(topic: str, encoding: str, schema: int, metadata: Iterable[tuple[str, str]] = ()) -> int:
+        def channel_id(topic: str, encoding: str, schema: int, metadata: tuple[tuple[str, str], ...] = ()) -> int:
             names.add(topic)
             return writer.register_channel(topic, encoding, schema, dict(metadata))
 
         for path in paths:
-            found, schemas, channels = list[Damage](), {0: 0}, dict[int, tuple[int, str]]()  # by the ids of this file
+            schemas, channels = {0: 0}, dict[int, tuple[int, str]]()  # by the ids of this file
 
             def report(read: int, before: int = done) -> None:
                 if progress is not None:
                     progress((before + read) / size)
 
-            for record in records(path, found, report):
+            for record in records(path, damages, report):
                 match record:
                     case Message() if record.channel_id in channels:
                         channel, topic = channels[record.channel_id]
@@ -143,9 +135,8 @@ def _copy(
                         attachments.add((name, data))
                         writer.add_attachment(created, logged, name, kind, data)
             done += path.stat().st_size
-            damages += [(path, damage) for damage in found]
         for (name, _), entries in last.items():  # descriptions also stand at the end, as the recorder writes them
             if name == DESCRIPTION_METADATA:
                 writer.add_metadata(name, entries)
         writer.finish()
-    return Copied(messages, sorted(names), damages)
+    return messages, sorted(names), damages

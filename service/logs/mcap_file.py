@@ -1,8 +1,7 @@
 """One MCAP file, whole or broken (https://mcap.dev/spec). Files are written by `mcap.writer.Writer`.
 
 A file that was closed ends in an index: its records are read where the index says, and a damaged one costs itself. A
-file of a killed recorder has none: it is read from the front up to the damage. Each damage is named with its byte and
-the time up to which messages were read before it.
+file of a killed recorder has none: it is read from the front up to the damage.
 """
 
 from __future__ import annotations
@@ -14,9 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 import zstandard
 from mcap.exceptions import McapError
@@ -26,13 +24,12 @@ from mcap.records import (
     Channel,
     Chunk,
     ChunkIndex,
-    Footer,
+    DataEnd,
     McapRecord,
     Message,
     Metadata,
     MetadataIndex,
     Schema,
-    Statistics,
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
@@ -43,46 +40,19 @@ DESCRIPTION_METADATA: Final = "aeroloop.description"
 RECORDER_METADATA: Final = "aeroloop.recorder"
 """Name of the metadata record about the file itself: its run, the recording's identity, its part, its beginning."""
 
-CHECKSUM: Final = "crc32"
-"""Entry of a metadata record with the checksum of the others: outside of chunks, MCAP has none."""
-
 CHUNK_BYTES: Final = 64 * 1024
 """A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
 
 MAX_CHUNK: Final = 16 << 20
 """Bytes that a record or the content of a chunk may have: a forged size costs no memory."""
 
-_HEAD: Final = struct.Struct("<BQ")
-_FOOTER_BYTES: Final = _HEAD.size + 20 + len(MAGIC)
-_CRC_BYTES: Final = 4
-_NEEDED: Final = (
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.MESSAGE,
-    Opcode.CHUNK,
-    Opcode.ATTACHMENT,
-    Opcode.METADATA,
-    Opcode.FOOTER,
-)
+_CHECKSUM: Final = "crc32"
+_HEAD: Final = struct.Struct("<BQ")  # opcode and length of a record
+_FOOTER: Final = struct.Struct("<BQQQI8s")  # with its head, and the magic after it
 _MALFORMED: Final = (struct.error, ValueError, OverflowError, McapError, zstandard.ZstdError)
 
+
 T = TypeVar("T")
-
-
-class Damage(NamedTuple):
-    """What could not be read, where it begins in the file, and the time of the last message before it [ns]."""
-
-    offset: int
-    what: str
-    after_ns: int = 0
-
-    def __str__(self) -> str:
-        if not self.offset:
-            return self.what
-        after = ""
-        if 0 < self.after_ns < 1 << 62:
-            after = f", after {datetime.fromtimestamp(self.after_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-        return f"{self.what} (byte {self.offset}{after})"
 
 
 class NotMcapError(ValueError):
@@ -90,7 +60,7 @@ class NotMcapError(ValueError):
 
 
 def records(
-    path: Path, damages: list[Damage] | None = None, progress: Callable[[int], None] | None = None
+    path: Path, damages: list[str] | None = None, progress: Callable[[int], None] | None = None
 ) -> Iterator[McapRecord]:
     """Schemas, channels, messages, metadata and attachments in the file's order; damaged ones are left out.
 
@@ -98,42 +68,40 @@ def records(
 
     Args:
         path: The file.
-        damages: What could not be read is appended.
+        damages: What could not be read is appended, each with its byte and the time of the last message before it.
         progress: Called after each record of the file with the bytes read so far.
 
     Raises:
         NotMcapError: It is no MCAP file.
         OSError: It cannot be read.
     """
-    chunk: list[McapRecord] = []  # what the last one held
+    last_ns = 0
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise NotMcapError(f"{path} does not begin as an MCAP file")
         index = _index(file)
         yield from (one for one in index or () if isinstance(one, (Schema, Channel)))
-        for at, size, opcode in _from_the_front(file) if index is None else _by_index(index):
+        for at, opcode in _from_the_front(file) if index is None else _by_index(index):
             try:
-                record = _record(file, at, size, opcode)
-                found = [record] if record is not None else []
-                if isinstance(record, Chunk):
-                    found = chunk = _contents(record)
+                record = _record(file, at, opcode)
+                found = _contents(record) if isinstance(record, Chunk) else [record]
             except _MALFORMED as error:
-                times = (one.log_time for one in chunk if isinstance(one, Message))
+                after = f", after {datetime.fromtimestamp(last_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC" * bool(last_ns)
                 if damages is not None:
-                    damages.append(Damage(at, str(error) or "a record ends too early", max(times, default=0)))
+                    damages.append(f"{error or 'a record ends too early'} (byte {at}{after})")
                 if index is None:
                     return
             else:
+                if isinstance(record, DataEnd):
+                    return
                 yield from found
+                last_ns = max((one.log_time for one in found if isinstance(one, Message)), default=last_ns)
             if progress is not None:
-                progress(at + size)
+                progress(file.tell())
 
 
 def messages(path: Path, wanted: Callable[[Channel], T | None]) -> Iterator[tuple[T, Message]]:
-    """Messages of some channels, each with what `wanted` returns for its channel; None skips the channel.
-
-    Damage and errors are as of `records`.
-    """
+    """Messages of some channels, each with what `wanted` returns for its channel; None skips the channel."""
     answers: dict[int, T | None] = {}
     for one in records(path):
         if isinstance(one, Channel) and one.id not in answers:
@@ -142,84 +110,56 @@ def messages(path: Path, wanted: Callable[[Channel], T | None]) -> Iterator[tupl
             yield answer, one
 
 
-def opening(path: Path) -> Metadata | None:
-    """The record after a file's header if it is metadata. Reads no further. Raises OSError."""
-    with path.open("rb") as file, suppress(*_MALFORMED):
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK)
-        record = next(islice(reader.records, 1, 2), None)
-        return record if isinstance(record, Metadata) else None
-    return None
-
-
 def with_checksum(name: str, entries: dict[str, str]) -> dict[str, str]:
-    """The entries of a metadata record, and their checksum."""
+    """The entries of a metadata record, and their checksum: outside of chunks, MCAP has none."""
     texts = [name, *(f"{key}={value}" for key, value in entries.items())]
-    return entries | {CHECKSUM: f"{zlib.crc32(chr(0).join(texts).encode()):08x}"}
+    return entries | {_CHECKSUM: f"{zlib.crc32(chr(0).join(texts).encode()):08x}"}
 
 
 def _index(file: BinaryIO) -> list[McapRecord] | None:
-    """The records of the index at the end; None if there is none, or it is damaged or not complete."""
-    end = os.fstat(file.fileno()).st_size - _FOOTER_BYTES
-    if end < len(MAGIC):
-        return None
-    with suppress(*_MALFORMED):
-        footer = _record(file, end, _FOOTER_BYTES - len(MAGIC), Opcode.FOOTER)
-        assert isinstance(footer, Footer)
-        if file.read() != MAGIC or not 0 < footer.summary_start <= end < footer.summary_start + MAX_CHUNK:
-            return None
-        file.seek(footer.summary_start)
+    """The records of the index at the end; None if there is none, or it is damaged."""
+    with suppress(OSError, *_MALFORMED):
+        file.seek(-_FOOTER.size, os.SEEK_END)
+        *_, start, _, checksum, magic = _FOOTER.unpack(file.read())
+        file.seek(start)
         data = file.read()
-        if zlib.crc32(data[: -_CRC_BYTES - len(MAGIC)]) != footer.summary_crc:
-            return None
-        index = list(StreamReader(BytesIO(data), skip_magic=True).records)
-        stated = (
-            one.chunk_count + one.metadata_count + one.attachment_count for one in index if isinstance(one, Statistics)
-        )
-        return index if len(_by_index(index)) == next(stated, None) else None
+        if magic == MAGIC and start and zlib.crc32(data[: -4 - len(MAGIC)]) == checksum:
+            return list(StreamReader(BytesIO(data), skip_magic=True).records)
     return None
 
 
-def _by_index(index: list[McapRecord]) -> list[tuple[int, int, int]]:
-    """Offset, size and opcode of each record that the index leads to, in the file's order."""
-    places: list[tuple[int, int, int]] = []
-    for one in index:
-        if isinstance(one, ChunkIndex):
-            places.append((one.chunk_start_offset, one.chunk_length, Opcode.CHUNK))
-        elif isinstance(one, (MetadataIndex, AttachmentIndex)):
-            kind = Opcode.METADATA if isinstance(one, MetadataIndex) else Opcode.ATTACHMENT
-            places.append((one.offset, one.length, kind))
-    return sorted(places)
+def _by_index(index: list[McapRecord]) -> list[tuple[int, int]]:
+    """Offset and opcode of each record that the index leads to, in the file's order."""
+    places = [(one.chunk_start_offset, Opcode.CHUNK) for one in index if isinstance(one, ChunkIndex)]
+    places += [(one.offset, Opcode.METADATA) for one in index if isinstance(one, MetadataIndex)]
+    return sorted([*places, *((one.offset, Opcode.ATTACHMENT) for one in index if isinstance(one, AttachmentIndex))])
 
 
-def _from_the_front(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Offset, size and opcode of each record of the data section; the last may be none, or cut."""
-    at, opcode = len(MAGIC), 0
-    while opcode != Opcode.DATA_END:
-        file.seek(at)
-        head = file.read(_HEAD.size)
-        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-        yield at, _HEAD.size + length, opcode
-        at += _HEAD.size + length
+def _from_the_front(file: BinaryIO) -> Iterator[tuple[int, None]]:
+    """Where each record of the data section begins: after the one before."""
+    at = len(MAGIC)
+    while True:
+        yield at, None
+        at = file.tell()
 
 
-def _record(file: BinaryIO, at: int, size: int, opcode: int) -> McapRecord | None:
-    """The record at a place; None if no reader needs it. Raises one of `_MALFORMED` if it is another, or damaged."""
-    left = os.fstat(file.fileno()).st_size - at
-    if left < _HEAD.size:
-        raise ValueError("the file is cut here" if left > 0 else "the file ends here, without its index")
-    if not 0 < opcode <= Opcode.DATA_END or size > MAX_CHUNK:
-        raise ValueError("no record begins here, and the file has no index")
-    if left < size:
-        raise ValueError(f"the file is cut within a record of {size} bytes")
+def _record(file: BinaryIO, at: int, opcode: int | None) -> McapRecord:
+    """The record at a place, of this kind. Raises one of `_MALFORMED` if it is another, or damaged."""
     file.seek(at)
-    block = file.read(size)
-    if block[: _HEAD.size] != _HEAD.pack(opcode, size - _HEAD.size):
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise ValueError("the file is cut here" if head else "the file ends here, without its index")
+    kind, length = _HEAD.unpack(head)
+    if not 0 < kind <= Opcode.DATA_END or length > MAX_CHUNK:
+        raise ValueError("no record begins here")
+    content = file.read(length)
+    if len(content) < length:
+        raise ValueError(f"the file is cut within a record of {_HEAD.size + length} bytes")
+    if opcode not in (None, kind):
         raise ValueError("the record that the index has here is damaged")
-    if opcode not in _NEEDED:
-        return None
-    record = next(StreamReader(BytesIO(block), skip_magic=True, emit_chunks=True).records)
-    if isinstance(record, Metadata) and CHECKSUM in record.metadata:
-        entries = {key: value for key, value in record.metadata.items() if key != CHECKSUM}
+    record = next(StreamReader(BytesIO(head + content), skip_magic=True, emit_chunks=True).records)
+    if isinstance(record, Metadata) and _CHECKSUM in record.metadata:
+        entries = {key: value for key, value in record.metadata.items() if key != _CHECKSUM}
         if with_checksum(record.name, entries) != record.metadata:
             raise ValueError(f"metadata {record.name} does not match its checksum")
     return record

@@ -1,17 +1,15 @@
 """A recording: the files of a run (one, a folder, or those of a rotated run) read as one.
 
-The files are read once for descriptions and the index of the traces, and again for what is wanted of them: the rows of
-a session, or the JSON messages of some keys.
+The files are read once for descriptions and traces, whose batches stay in memory (140 MB an hour at 500 Hz), and again
+for the JSON messages of some keys.
 """
 
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from itertools import chain
-from math import inf
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import ceil, inf
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -23,16 +21,9 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, End, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
-from aeroloop.service.logs.mcap_file import (
-    DESCRIPTION_METADATA,
-    RECORDER_METADATA,
-    Damage,
-    NotMcapError,
-    messages,
-    records,
-)
-from aeroloop.service.logs.session import ANSWER_S, Session, SessionKey, Source, TableBuilder, join, table_dtype
-from aeroloop.service.logs.trace_index import Entry, TraceIndex, identity_of
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
+from aeroloop.service.logs.session import Session, SessionKey, join, table_of
+from aeroloop.service.logs.trace_index import Source, TraceIndex
 
 Progress = Callable[[float], None]
 """Called repeatedly with the share done, 0…1."""
@@ -40,8 +31,12 @@ Progress = Callable[[float], None]
 INDEXING: Final = 0.4
 """Share of the progress that the first look at the files takes."""
 
+ANSWER_S: Final = 1.2
+"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
+
 OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
-"""Sections of the configuration by the role that owns them; the others are the controller's."""
+"""Sections of the configuration by the role that owns them; the others are the controller's. Why: every process is
+configured by itself: the controller's copy of `plant.mass` may differ from the plant's."""
 
 T = TypeVar("T")
 
@@ -63,7 +58,7 @@ class Recording:
         extents: Recorded extent of each session, in the order of recording.
         missing: Rows that the log lacks.
         unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
-        damages: What of each file is cut or damaged.
+        damaged: What of the files is cut or damaged, a line each.
         malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
 
     Raises:
@@ -72,15 +67,15 @@ class Recording:
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.metadata: dict[str, dict[str, Any]] = {}
-        self.damages: defaultdict[Path, list[Damage]] = defaultdict(list)
+        self.damaged: list[str] = []
         self.malformed: Counter[str] = Counter()
-        self._descriptions: dict[tuple[str, str], list[tuple[int, Description]]] = {}  # by time of publication, or 0
+        self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
         self._begun_ns: dict[Source | tuple[SessionKey, End], int] = {}  # first publication of rows
         self._index = TraceIndex()
         begins_ns = {path: _begin_ns(path) for path in _files(paths)}
         self.paths = sorted(begins_ns, key=begins_ns.__getitem__)
         size, done = max(1, sum(path.stat().st_size for path in self.paths)), 0
-        copies: list[tuple[Path, int, str | bytes, Address | None]] = []
+        copies = list[_Copy]()
         marks = dict[Path, set[object]]()
         for path in self.paths:
 
@@ -99,18 +94,14 @@ class Recording:
     @property
     def name(self) -> str:
         """Name of the run."""
-        first = str(self.paths[0])
-        return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
-
-    @property
-    def damaged(self) -> list[str]:
-        """What of the files is cut or damaged, a line each."""
-        return [f"{path}: {damage}" for path, found in self.damages.items() for damage in found]
+        return str(self.paths[0]) + (f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else "")
 
     @property
     def unread(self) -> list[str]:
         """What could not be read, a line each: damages, then malformed messages."""
-        return [*self.damaged, *malformed_lines(self.malformed)]
+        return [*self.damaged, *(f"malformed: {n} of {topic}" for topic, n in sorted(self.malformed.items()) if n)]
+
+    # ── sessions ──
 
     def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
         """A session. Raises ReviewError if there is none.
@@ -120,21 +111,21 @@ class Recording:
                 with the most ticks if None.
             vehicle: Its vehicle; any if None, and that of the longest session for a number.
         """
-        known = list(self.extents) if vehicle is None else self.sessions_of(vehicle)
         if not self.extents:
             raise ReviewError(f"{self.name} holds no session: no trace of a controller or a plant was recorded")
+        known = [which for which in self.extents if vehicle in (None, which[0])]
         if not known:
             vehicles = ", ".join(dict.fromkeys(vehicle for vehicle, _ in self.extents))
             raise ReviewError(f"{self.name} holds no session of {vehicle}, only of {vehicles}")
         longest = max(known, key=lambda which: self.extents[which].ticks)
         if session is None:
             return longest
-        for which in known:
-            if session in (which[1], "/".join(which)):
-                return which
         numbered = self.sessions_of(longest[0])
-        if session.isdecimal() and 0 < int(session) <= len(numbered):
-            return numbered[int(session) - 1]
+        named = {str(i): which for i, which in enumerate(numbered, 1)}
+        for which in reversed(known):
+            named |= {which[1]: which, "/".join(which): which}
+        if session in named:
+            return named[session]
         names = ", ".join(f"{i} {which[1]}" for i, which in enumerate(numbered[:20], 1))
         more = f" and {len(numbered) - 20} more" if len(numbered) > 20 else ""
         raise ReviewError(f"{self.name} holds no session {session!r}; of {longest[0]} it holds {names}{more}")
@@ -143,6 +134,46 @@ class Recording:
         """Sessions of a vehicle, in the order of recording."""
         return [which for which in self.extents if which[0] == vehicle]
 
+    def session(self, which: SessionKey, since_s: float = -inf, until_s: float = inf) -> Session:
+        """A session's rows and their join, from and to a time on the law's clock [s]; no other rows are read.
+
+        Raises:
+            ReviewError: The logs have no description of it.
+            ConfigError: A description is not of this version.
+        """
+        settings = self.settings(which)
+        first, last = since_s / settings.loop.period, until_s / settings.loop.period
+        acted = last + ceil(ANSWER_S / settings.loop.period)  # when the last answer acts
+        unknown = [one for one in self.unknown if (one.vehicle, one.session) == which]
+        parts = {end: [one for one in self._index.parts[which, end] if one.header.rows] for end in ENDS}
+        computed = [
+            one
+            for one in parts["controller"]
+            if one.first <= last and one.last >= first
+            if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
+        ]
+        controller, states, left_out = table_of("controller", settings.wire, computed)
+        its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
+        plant, _, more_left_out = table_of("plant", settings.wire, its)
+        self.malformed["trace"] += left_out + more_left_out
+        for gap in unknown:
+            plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
+        return Session(
+            which,
+            settings,
+            self.described(which),
+            self.extents[which],
+            controller,
+            plant,
+            [change for change in self._index.changes[which] if change.tick <= last],
+            states,
+            [gap for gap in self.missing if (gap.vehicle, gap.session) == which],
+            unknown,
+            *join(controller, plant, first, last),
+        )
+
+    # ── descriptions ──
+
     @property
     def descriptions(self) -> dict[tuple[str, str], Description]:
         """The last description of each vehicle and role."""
@@ -150,8 +181,9 @@ class Recording:
 
     def described(self, which: SessionKey) -> dict[str, Description]:
         """Descriptions of a session's vehicle when it began, by role; and of the recorder."""
-        found = {role: last for (_, role), last in self.descriptions.items() if role == "recorder"}
-        found |= {role: last for (vehicle, role), last in self.descriptions.items() if vehicle == which[0]}
+        known = self.descriptions.items()
+        found = {role: last for (_, role), last in known if role == "recorder"}
+        found |= {role: last for (vehicle, role), last in known if vehicle == which[0]}
         for end in ENDS:
             if its := self._described_at(which[0], end, self._begun_ns.get((which, end))):
                 found[end] = its
@@ -159,8 +191,6 @@ class Recording:
 
     def settings(self, which: SessionKey) -> Settings:
         """The configuration of a session, each section from the role that owns it, as far as the log has the role.
-
-        Why: every process is configured by itself: the controller's copy of `plant.mass` may differ from the plant's.
 
         Raises:
             ReviewError: The logs have no description of its controller or plant.
@@ -177,112 +207,59 @@ class Recording:
         owned = {section: getattr(its, section) for role, its in owners.items() for section in OWNED[role]}
         return from_description(config).model_copy(update=owned)  # not validated again: each role ran by its own
 
-    def session(self, which: SessionKey, since_s: float = -inf, until_s: float = inf) -> Session:
-        """A session's rows and their join, from and to a time on the law's clock [s]; no other rows are read.
+    def _described_at(self, vehicle: str, role: str, at_ns: int | None) -> Description | None:
+        """The last description that a role published before a time [ns since 1970]; else its first."""
+        found = self._descriptions.get((vehicle, role))
+        if found is None or at_ns is None:
+            return None
+        return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
 
-        Raises:
-            ReviewError: The logs have no description of it, or it takes more memory than there is.
-            ConfigError: A description is not of this version.
-        """
-        settings = self.settings(which)
-        first, last = since_s / settings.loop.period, until_s / settings.loop.period
-        tables: dict[End, TableBuilder] = {}
-        wanted: dict[End, list[Entry]] = {}
-        for end in ENDS:
-            until = last + (settings.loop.ticks(ANSWER_S) if end == "plant" else 0)  # when the last answer acts
-            wanted[end] = self._index.part(which, end, first, until)
-            rows = sum(entry.rows for entry in wanted[end])
-            check_memory(rows * table_dtype(end, settings.wire).itemsize, rows)
-            tables[end] = TableBuilder(end, settings.wire, rows)
-        for end, batch in self._batches(wanted):
-            tables[end].add(batch)
-        self.malformed["trace"] += sum(table.malformed for table in tables.values())
-        unknown = [one for one in self.unknown if (one.vehicle, one.session) == which]
-        controller, plant = tables["controller"].table(), tables["plant"].table(unknown)
-        k, at_controller, at_plant, acted = join(controller, plant, first, last)
-        return Session(
-            which=which,
-            settings=settings,
-            descriptions=self.described(which),
-            extent=self.extents[which],
-            controller=controller,
-            plant=plant,
-            changes=[change for change in self._index.changes[which] if change.tick <= last],
-            states=tables["controller"].states,
-            missing=[gap for gap in self.missing if (gap.vehicle, gap.session) == which],
-            unknown=unknown,
-            k=k,
-            at_controller=at_controller,
-            at_plant=at_plant,
-            acted=acted,
-        )
+    # ── what else is in the files ──
 
-    def plants(self) -> dict[Source, tuple[Description | None, int]]:
-        """Processes of plants, with the description of each as it began, and its recorded rows."""
-        return {
-            source: (
-                self._described_at(source.vehicle, "plant", self._begun_ns[source]),
-                sum(entry.rows for entry in entries),
-            )
-            for source, entries in self._index.entries.items()
-            if source.end == "plant" and entries
-        }
-
-    def batches(self, sources: Iterable[Source]) -> Iterator[tuple[Source, Batch]]:
-        """All batches of some processes, each in the order of its rows and none twice."""
-        return self._batches({source: self._index.entries[source] for source in sources})
-
-    def _batches(self, wanted: Mapping[T, Sequence[Entry]]) -> Iterator[tuple[T, Batch]]:
-        """Some batches, by any key, in the order that they have there."""
-        orders = {key: deque(entry.identity for entry in entries) for key, entries in wanted.items()}
-        keys = {identity: key for key, order in orders.items() for identity in order}
-        waiting: dict[int, Batch] = {}
-        for vehicle, found in self.messages(lambda address: address.vehicle if address.topic.name == "trace" else None):
-            identity = identity_of(vehicle, found.data)
-            if (key := keys.pop(identity, None)) is None or (batch := read_batch(found.data)) is None:
-                continue
-            waiting[identity] = batch
-            while orders[key] and orders[key][0] in waiting:
-                yield key, waiting.pop(orders[key].popleft())
+    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
+        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
+        for source, entries in self._index.entries.items():
+            if source.end == "plant" and entries:
+                batches = [batch for one in entries if (batch := read_batch(one.payload)) is not None]
+                yield source, self._described_at(source.vehicle, "plant", self._begun_ns[source]), batches
 
     def messages(self, wanted: Callable[[Address], T | None]) -> Iterator[tuple[T, Message]]:
         """Messages of the keys that `wanted` selects, in the order of recording, each with its result for the key.
 
         It is called once per key of a file; None drops the key.
         """
-
-        def of(channel: Channel) -> T | None:
-            address = topics.read_key(channel.topic)
-            return None if address is None else wanted(address)
-
         for path in self.paths:
-            yield from messages(path, of)
+            answers: dict[int, T | None] = {}
+            for one in records(path):
+                if isinstance(one, Channel) and one.id not in answers:
+                    address = topics.read_key(one.topic)
+                    answers[one.id] = None if address is None else wanted(address)
+                elif isinstance(one, Message) and (answer := answers.get(one.channel_id)) is not None:
+                    yield answer, one
 
-    # ── The first look at the files ──
+    # ── the first look at the files ──
 
-    def _read(
-        self,
-        path: Path,
-        progress: Callable[[int], None],
-        copies: list[tuple[Path, int, str | bytes, Address | None]],
-    ) -> set[object]:
-        """Read a file's metadata and index its traces; returns what marks its run.
-
-        Copies of descriptions are appended to `copies`: file, time of publication (0 of metadata), text and key.
-        """
+    def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> set[object]:
+        """Read a file's metadata, descriptions and traces; returns what marks its run, nothing without a trace."""
         addresses: dict[int, Address | None] = {}
-        marks: set[object] = set()
+        marks, damages = set[object](), list[str]()
         identity: object = path
-        for record in records(path, self.damages[path], progress):
+        for record in records(path, damages, progress):
             match record:
                 case Channel():
                     addresses[record.id] = topics.read_key(record.topic)
                 case Metadata(name=name, metadata=entries) if name == DESCRIPTION_METADATA:
                     copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
-                case Metadata(name=name) if name.startswith("aeroloop."):
-                    content = self._add_metadata(path, record)
-                    if name == RECORDER_METADATA and isinstance(content.get("id"), str):
-                        identity = content["id"]
+                case Metadata(name=name, metadata=entries) if name.startswith("aeroloop."):
+                    try:
+                        content = json.loads(entries.get("json", "{}"))
+                    except (ValueError, RecursionError) as error:
+                        damages.append(f"metadata {name}: {str(error).splitlines()[0]}")
+                        continue
+                    if isinstance(content, dict):
+                        self.metadata[name.removeprefix("aeroloop.")] = content
+                        if name == RECORDER_METADATA and isinstance(content.get("id"), str):
+                            identity = content["id"]
                 case Message() if (address := addresses.get(record.channel_id)) is not None:
                     if address.topic.name == "description":
                         copies.append((path, record.publish_time, record.data, address))
@@ -291,49 +268,37 @@ class Recording:
                         which = address.vehicle, session
                         marks |= {source, which} if session else {source}
                         for one in (source, (which, source.end)):
-                            self._begun_ns.setdefault(one, record.publish_time)
-                            self._begun_ns[one] = min(self._begun_ns[one], record.publish_time)
+                            self._begun_ns[one] = min(self._begun_ns.get(one, record.publish_time), record.publish_time)
+        self.damaged += [f"{path}: {damage}" for damage in damages]
         return marks and {*marks, identity}
 
-    def _add_metadata(self, path: Path, record: Metadata) -> dict[str, Any]:
-        try:
-            content = json.loads(record.metadata.get("json", "{}"))
-        except (ValueError, RecursionError) as error:
-            self.damages[path].append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
-            content = {}
-        content = content if isinstance(content, dict) else {}
-        self.metadata[record.name.removeprefix("aeroloop.")] = content
-        return content
-
-    def _add_descriptions(self, copies: Sequence[tuple[Path, int, str | bytes, Address | None]]) -> None:
+    def _add_descriptions(self, copies: Sequence[_Copy]) -> None:
         """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
 
         One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
         end it is a damage. Why: without it, the other end's configuration stands for it.
         """
-        unreadable: list[tuple[Path, int, Address | None, str]] = []
-        for path, at_ns, text, address in sorted(copies, key=lambda one: one[1]):
+        unreadable = list[tuple[_Copy, str]]()
+        for copy in sorted(copies, key=lambda one: one[1]):
             try:
-                found = read_description(text, address)
+                found = _read_description(copy[2], copy[3])
             except ValueError as error:
-                unreadable.append((path, at_ns, address, str(error).splitlines()[0]))
+                unreadable.append((copy, str(error).splitlines()[0]))
             else:
-                self._descriptions.setdefault((found.vehicle, found.role), []).append((at_ns, found))
+                self._descriptions[found.vehicle, found.role].append((copy[1], found))
         if unreadable and not self._descriptions:
-            raise ReviewError(f"{unreadable[0][0]} is not a log of this version: {unreadable[0][-1]}")
-        for path, at_ns, address, why in unreadable:
+            (path, *_), why = unreadable[0]
+            raise ReviewError(f"{path} is not a log of this version: {why}")
+        for (path, at_ns, _, address), why in unreadable:
             known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
             if at_ns and known:
                 self.malformed["description"] += 1
             else:
-                self.damages[path].append(Damage(0, f"a description: {why}"))
+                self.damaged.append(f"{path}: a description: {why}")
 
-    def _described_at(self, vehicle: str, role: str, at_ns: int | None) -> Description | None:
-        """The last description that a role published before a time [ns since 1970]; else its first."""
-        found = self._descriptions.get((vehicle, role))
-        if found is None or at_ns is None:
-            return None
-        return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
+
+_Copy = tuple[Path, int, str | bytes, Address | None]
+"""A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
 
 
 def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
@@ -345,8 +310,9 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
     for path, its in marks.items():
         if its:  # else it has no trace to be mixed with others
             related = [run for run in runs if run[0] & its]
+            paths = [one for run in related for one in run[1]]
             runs = [run for run in runs if run not in related]
-            runs.append((its.union(*(run[0] for run in related)), [*chain(*(run[1] for run in related)), path]))
+            runs.append((its.union(*(run[0] for run in related)), [*paths, path]))
     if len(runs) > 1:
         names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
         some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
@@ -356,13 +322,8 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
         )
 
 
-def read_description(text: str | bytes, address: Address | None) -> Description:
-    """Parse a description, recorded under a key.
-
-    Raises:
-        ValueError: It is malformed, of another role or vehicle than its key says, of another protocol version, or its
-            configuration is.
-    """
+def _read_description(text: str | bytes, address: Address | None) -> Description:
+    """Parse a description, recorded under a key. Raises ValueError if it is malformed, or not what its key says."""
     try:
         content = json.loads(text)
     except RecursionError:
@@ -371,7 +332,7 @@ def read_description(text: str | bytes, address: Address | None) -> Description:
         raise ValueError("a description is no JSON object")
     if (version := content.get("protocol", PROTOCOL_VERSION)) != PROTOCOL_VERSION:
         raise ValueError(f"it is of protocol version {version}; read it with the aeroloop that wrote it")
-    description = Description.model_validate(content)
+    description = Description.model_validate(content, extra="ignore")
     if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
         raise ValueError(f"a description of {address.vehicle}'s {address.role} is of another role")
     try:
@@ -381,34 +342,10 @@ def read_description(text: str | bytes, address: Address | None) -> Description:
     return description
 
 
-def malformed_lines(malformed: Mapping[str, int]) -> list[str]:
-    """Malformed messages by topic, a line each."""
-    return [f"malformed: {count} of {topic}" for topic, count in sorted(malformed.items()) if count]
-
-
-def check_memory(needed: int, ticks: int) -> None:
-    """Raise ReviewError if so many bytes are not available, for so many ticks."""
-    available = available_bytes()
-    if needed > available:
-        raise ReviewError(
-            f"{ticks} ticks take {needed / 2**30:.1f} GiB of memory, and {available / 2**30:.1f} GiB are available: "
-            "`aeroloop log review` and `aeroloop log export` read a part with --from and --to"
-        )
-
-
-def available_bytes() -> float:
-    """Memory that can still be had; infinite where the system does not say [bytes]."""
-    with suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return float(line.split()[1]) * 1024
-    return inf
-
-
 def _begin_ns(path: Path) -> int:
     """When a file's first message was recorded [ns since 1970]; 0 without any. Raises ReviewError."""
     try:
-        return next((one.log_time for _, one in messages(path, lambda _: True)), 0)
+        return next((one.log_time for one in records(path) if isinstance(one, Message)), 0)
     except NotMcapError as error:
         raise ReviewError(f"{error}, so it is no log") from None
     except OSError as error:

@@ -9,23 +9,23 @@ the log's plant does not respond to that, so it is no simulation.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from math import inf, sqrt
+from math import sqrt
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.hosts.trace import PlantDifference, PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed, why_not
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
-from aeroloop.service.logs.session import Missing, SessionKey, Source, Unknown
+from aeroloop.service.logs.session import Missing, SessionKey, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
 
 
@@ -75,7 +75,6 @@ class Replay(BaseModel, frozen=True):
         description="by end that was asked for: what was not compared, since the log lacks it, is cut or damaged, or "
         "cannot be computed again from it"
     )
-
     details: dict[End, list[str]] = Field(
         default={}, exclude=True, description="by end: what its first difference is in units and steps, in words"
     )
@@ -96,8 +95,6 @@ def replay(
     overrides: Sequence[str] = (),
     progress: Progress | None = None,
     ends: Collection[End] = ENDS,
-    since_s: float = -inf,
-    until_s: float = inf,
 ) -> Replay:
     """Replay every session of a run.
 
@@ -107,8 +104,6 @@ def replay(
             or of the reference replaces every logged change of them. The plant is not replayed then.
         progress: Called repeatedly with the share done, 0…1.
         ends: Ends to replay; the plant takes most of the time.
-        since_s: From when on, on each session's law clock [s]. The plant is not replayed in part.
-        until_s: Until when [s].
 
     Raises:
         ReviewError: It cannot be read, or has no configuration of any end.
@@ -116,24 +111,14 @@ def replay(
     """
     recording = Recording(paths, progress)
     recording.choose()  # raises where there is no session
-    periods = dict[SessionKey, float]()
-
-    def within(one: Missing | Unknown) -> bool:
-        period = periods.get((one.vehicle, one.session))
-        last = inf if one.last_tick is None else one.last_tick
-        return period is None or (one.first_tick <= until_s / period and last >= since_s / period)
-
-    details: dict[End, list[str]] = {}
-    unseen: dict[End, list[str]] = {}
     reasons: dict[str, str] = {end: "only the other end was replayed" for end in ENDS if end not in ends}
-    sessions: list[SessionReplay] = []
-    plants: list[PlantReplayed] = []
+    details, unseen = dict[End, list[str]](), dict[End, list[str]]()
+    sessions, plants = list[SessionReplay](), list[PlantReplayed]()
     failed: dict[SessionKey, AeroloopError] = {}
     if "controller" in ends:
         for which in (which for which, extent in recording.extents.items() if extent.rows["controller"]):
             try:
-                periods[which] = recording.settings(which).loop.period
-                one, differences = _replay_session(recording, which, overrides, progress, (since_s, until_s))
+                one, differences = _replay_session(recording, which, overrides, progress)
             except AeroloopError as error:
                 if overrides:
                     raise
@@ -142,7 +127,7 @@ def replay(
                 sessions.append(one)
                 if differences:
                     details.setdefault("controller", differences)
-        unseen["controller"] = [str(one) for one in recording.unknown if within(one)]
+        unseen["controller"] = [str(one) for one in recording.unknown]
         if failed:
             reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
             left = sum(recording.extents[which].rows["controller"] for which in failed)
@@ -151,15 +136,13 @@ def replay(
             reasons["controller"] = "the log has no trace of a controller"
     if overrides:
         reasons["plant"] = "the plant of a log does not follow another configuration"
-    elif (since_s, until_s) != (-inf, inf):
-        reasons.setdefault("plant", "a plant is replayed from its first row on only, so not in part")
     elif "plant" in ends:
         plants, reason, unseen["plant"], details["plant"] = _replay_plants(recording, progress)
         if reason is not None:
             reasons["plant"] = reason
     if failed and not (sessions or plants):
         raise next(iter(failed.values()))
-    missing = [gap for gap in recording.missing if gap.end in ends and within(gap)]
+    missing = [gap for gap in recording.missing if gap.end in ends]
     for end, its in unseen.items():
         lacks = [f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows]
         unseen[end] = [*lacks, *its, *recording.damaged]
@@ -167,7 +150,7 @@ def replay(
         controller=_sum(sessions),
         plant=_sum([result for result in plants if result.ticks]),
         reasons=reasons,
-        unknown=[one for one in recording.unknown if within(one)],
+        unknown=recording.unknown,
         sessions=sessions,
         plants=plants,
         missing=missing,
@@ -183,51 +166,44 @@ def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay 
     return EndReplay(ticks=sum(part.ticks for part in parts), differ=sum(part.differ for part in parts))
 
 
-# ── The controller ──
-
-
 def _replay_session(
-    recording: Recording,
-    which: SessionKey,
-    overrides: Sequence[str],
-    progress: Progress | None,
-    part_s: tuple[float, float],
+    recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None
 ) -> tuple[SessionReplay, list[str]]:
     """Replay a session; the first difference also in words. Raises AeroloopError if that cannot be."""
     settings = load_over(recording.settings(which), overrides)
     parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
     ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
-    session = recording.session(which, *part_s)
+    session = recording.session(which)
     logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
     rows, wire, period = session.controller, settings.wire, settings.loop.period
-    nothing, blank = bytes(session.settings.wire.command.size), bytes(wire.command.size)
+    blank = bytes(wire.command.size)
     sent_as, frames = bytearray(), bytearray()
-    differ: list[int] = []
 
     def share(done: float) -> None:
         if progress is not None:
             progress(INDEXING + (1 - INDEXING) / 2 * done)
 
-    columns = [rows[name] for name in ("tick", "received_as", "measurement", "sent_as", "command")]
-    for i, (tick, received_as, measurement, logged_as, command) in enumerate(in_rows(columns, share)):
+    for i, (tick, received_as, measurement) in enumerate(
+        in_rows([rows[name] for name in ("tick", "received_as", "measurement")], share)
+    ):
         logged.resume(i)
         answer = logged.answer(tick, received_as, measurement)
         sent_as.append(Sent.NONE if answer is None else Sent.FRAME if answer else Sent.SILENT)
         frames += answer or blank
-        if (sent_as[i], answer or nothing) != (logged_as, command):
-            differ.append(i)
 
     computed_as, computed = np.frombuffer(sent_as, np.uint8), np.frombuffer(frames, f"V{wire.command.size}")
-    since, until = (at_s / session.settings.loop.period for at_s in part_s)
-    within = (rows["tick"] >= since) & (rows["tick"] <= until)
-    answered, differ = (computed_as != Sent.NONE) & within, [i for i in differ if within[i]]
+    of_one_size = wire.command.size == session.settings.wire.command.size
+    differ = (computed_as != rows["sent_as"]) | (
+        computed != rows["command"] if of_one_size else computed_as == Sent.FRAME
+    )
+    answered = computed_as != Sent.NONE
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
     after, _ = commanded(session, wire, computed_as, computed)
     before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
     square, ticks = added(0.0, squares(after - before)), int(answered.sum())
     difference, details = None, list[str]()
-    if differ:
-        first = differ[0]
+    if differ.any():
+        first = int(np.argmax(differ))
         tick, was_as, now_as = int(rows["tick"][first]), Sent(int(rows["sent_as"][first])), Sent(sent_as[first])
         was, now = bytes(rows["command"][first]), bytes(computed[first])
         difference = TickDifference(
@@ -238,22 +214,19 @@ def _replay_session(
         )
         if was_as == now_as == Sent.FRAME:
             signals = [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
-            details = in_units(wire.command, signals, was, now)
+            details = _in_units(wire.command, signals, was, now)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],
-        first_tick=int(rows["tick"][within][0]) if within.any() else None,
+        first_tick=int(rows["tick"][0]) if len(rows) else None,
         ticks=ticks,
-        differ=len(differ),
+        differ=int(differ.sum()),
         first_difference=difference,
         rms_v=sqrt(square / ticks) if ticks else None,
         max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
         u_total_logged=added(0.0, squares(before)) * period,
         u_total_computed=added(0.0, squares(after)) * period,
     ), details
-
-
-# ── The plant ──
 
 
 def _replay_plants(
@@ -264,62 +237,48 @@ def _replay_plants(
     Returns the result of each process, the reason if there is none or one ends early, which rows are not compared, and
     the first difference in words.
     """
-    replays: dict[Source, PlantReplay] = {}
-    reasons: dict[Source, str] = {}
-    wires: dict[Source, WireSpec] = {}
-    rows: dict[Source, int] = {}
-    for source, (description, count) in recording.plants().items():
-        rows[source] = count
-        if description is None:
-            reasons[source] = f"the log has no description of {source.vehicle}'s plant"
-            continue
-        its = from_description(description.config)
-        if (why := why_not(its.plant)) is not None:
-            reasons[source] = why
-            del rows[source]  # no log of it could be compared
-            continue
-        try:
-            replays[source], wires[source] = PlantReplay(its.loop, its.wire, its.plant), its.wire
-        except PlantError as error:
-            reasons[source] = str(error)
-    done, total = 0, max(1, sum(rows.values()))
-    for source, batch in recording.batches(replays):
-        replays[source].feed(batch)
-        done += batch.header.rows
-        if progress is not None:
-            progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * min(1.0, done / total))
-    results = {source: one.result() for source, one in replays.items()}
-    reasons |= {source: one.stopped for source, one in results.items() if one.stopped is not None}
+    results, reasons = list[PlantReplayed](), list[str]()
     unseen, details = list[str](), list[str]()
-    for source, count in rows.items():
-        left = count - (results[source].ticks if source in results else 0)
+    plants = list(recording.plants())
+    done, total = 0, max(1, sum(batch.header.rows for *_, batches in plants for batch in batches))
+    for source, description, batches in plants:
+        left, reason = sum(batch.header.rows for batch in batches), None
+        if description is None:
+            reason = f"the log has no description of {source.vehicle}'s plant"
+        else:
+            its = from_description(description.config)
+            if (why := why_not(its.plant)) is not None:  # no log of it could be compared
+                reasons.append(why)
+                continue
+            try:
+                one = PlantReplay(its.loop, its.wire, its.plant)
+            except PlantError as error:
+                reason = str(error)
+            else:
+                for batch in batches:
+                    one.feed(batch)
+                    done += batch.header.rows
+                    if progress is not None:
+                        progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * done / total)
+                results.append(result := one.result())
+                left, reason, first = left - result.ticks, result.stopped, result.first_difference
+                if first is not None and first.field == "measurement" and not details:
+                    signals = [(f"ε{i}", "", its.wire.attitude) for i in (1, 2, 3)]
+                    signals += [(f"ω{i}", " rad/s", its.wire.rate) for i in (1, 2, 3)]
+                    frames = map(bytes.fromhex, (first.logged, first.computed))
+                    details = _in_units(its.wire.measurement, signals, *frames)
+        if reason is not None:
+            reasons.append(reason)
         if left > 0:
-            unseen.append(f"{left} of the plant's rows: {reasons.get(source, 'a batch of them cannot be read')}")
-    for source, one in results.items():
-        if one.first_difference is not None and not details:
-            details = _plant_difference(one.first_difference, wires[source])
+            unseen.append(f"{left} of the plant's rows: {reason or 'a batch of them cannot be read'}")
     none = None if results else "the log has no trace of a plant"
-    return list(results.values()), next(iter(reasons.values()), none), unseen, details
+    return results, next(iter(reasons), none), unseen, details
 
 
-def _plant_difference(first: PlantDifference, wire: WireSpec) -> list[str]:
-    """The signals of a measurement that differ, in words; any other column is in its own words already."""
-    if first.field != "measurement":
-        return []
-    signals = [(f"ε{i}", "", wire.attitude) for i in (1, 2, 3)] + [(f"ω{i}", " rad/s", wire.rate) for i in (1, 2, 3)]
-    return in_units(wire.measurement, signals, bytes.fromhex(first.logged), bytes.fromhex(first.computed))
-
-
-# ── Differences in words ──
-
-
-def in_units(
+def _in_units(
     kind: FrameFormat, signals: Sequence[tuple[str, str, SignalSpec]], logged: bytes, computed: bytes
 ) -> list[str]:
-    """What differs between two frames, a line per signal: both values in units, and how many quantizer steps apart.
-
-    `signals` has the name, the unit and the specification of each.
-    """
+    """What differs between two frames, a line per signal: both values in units, and how many quantizer steps apart."""
     was, now = kind.unpack(logged), kind.unpack(computed)
     if was is None or now is None:
         return [f"the {'logged' if was is None else 'computed'} frame is malformed"]

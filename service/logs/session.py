@@ -1,19 +1,30 @@
-"""A session of a log: a table of rows for each end, joined on the tick."""
+"""A session of a log: a table of rows for each end, joined on the tick; and the plant's true states."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from aeroloop.protocol.messages.models import Description
+from aeroloop.protocol.messages.models import MAX_SIGNALS, Description, Truth
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import NEVER, Batch, End, Outcome, Received, row_dtype
+from aeroloop.protocol.messages.trace import (
+    NEVER,
+    Batch,
+    End,
+    Header,
+    Outcome,
+    Received,
+    Tail,
+    read_batch,
+    read_columns,
+    row_dtype,
+)
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings
 
@@ -25,21 +36,7 @@ Table = npt.NDArray[np.void]
 SessionKey = tuple[str, str]
 """A vehicle and a session."""
 
-Range = tuple[int, int]
-"""First and last tick."""
-
 NO_TICK: Final = -1
-
-ANSWER_S: Final = 1.2
-"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
-
-
-class Source(NamedTuple):
-    """A process of an end."""
-
-    vehicle: str
-    end: End
-    run: int
 
 
 class Missing(BaseModel, frozen=True):
@@ -129,52 +126,55 @@ class Session:
     acted: Places
 
 
-class TableBuilder:
-    """Fills the table of one end's rows, batch by batch in order; at most `rows` of them.
+class Entry(NamedTuple):
+    """A batch of a trace, as it was recorded."""
 
-    `states` has the controller's state before its first row and each first row after a gap. A batch of another wire is
-    left out and counted in `malformed`.
+    header: Header
+    payload: bytes
+    first: int  # tick of the first row
+    last: int  # highest tick; a late row is of an earlier one
+    proof: int  # a tick of the other end whose row there must be
+    changes: list[Change]
+    record: list[Change]
+
+    @property
+    def after(self) -> int:
+        """Number of the first row after it."""
+        return self.header.first_row + self.header.rows
+
+
+def table_of(end: End, wire: WireSpec, batches: Sequence[Entry]) -> tuple[Table, dict[int, dict[str, Any]], int]:
+    """One end's rows, from batches in order.
+
+    Returns:
+        The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
-
-    def __init__(self, end: End, wire: WireSpec, rows: int) -> None:
-        self.states: dict[int, dict[str, Any]] = {}
-        self.malformed = 0
-        self._wire = wire.measurement.size, wire.command.size, wire.actuators
-        self._filled, self._next_row = 0, -1
-        self._table = np.zeros(rows, table_dtype(end, wire))
-
-    def add(self, batch: Batch) -> None:
-        """Add the next batch."""
-        header = batch.header
-        if (header.measurement_bytes, header.command_bytes, header.actuators) != self._wire:
-            self.malformed += 1
-            return
-        begin, self._filled = self._filled, self._filled + header.rows
-        if header.first_row != self._next_row and batch.tail.state is not None:
-            self.states[begin] = batch.tail.state
-        self._next_row = header.first_row + header.rows
-        rows = self._table[begin : self._filled]
+    sizes = wire.measurement.size, wire.command.size, wire.actuators
+    fitting = [
+        (header, payload)
+        for header, payload, *_ in batches
+        if (header.measurement_bytes, header.command_bytes, header.actuators) == sizes
+    ]
+    kinds = row_dtype(end, *sizes)
+    wide = {"tick", "session_tick", "answered", "received", "sent"}
+    columns = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or ()]
+    table = np.zeros(sum(header.rows for header, _ in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
+    states = dict[int, dict[str, Any]]()
+    filled, next_row = 0, -1
+    for header, payload in fitting:
+        batch = Batch(header, read_columns(header, payload), Tail())
+        if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
+            states[filled] = whole.tail.state
+        next_row = header.first_row + header.rows
+        rows = table[filled : filled + header.rows]
         for name, column in batch.columns.items():
             rows[name] = column
         rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
         rows["wall"] = header.wall_ns - header.monotonic_ns
-        if "answered" in batch.columns:
-            rows["answered"][rows["answered"] == NEVER] = NO_TICK
-
-    def table(self, unknown: Sequence[Unknown] = ()) -> Table:
-        """All rows, without those of the plant at unknown ticks."""
-        table = self._table[: self._filled]
-        for one in unknown if "session_tick" in (table.dtype.names or ()) else ():
-            table = table[(table["session_tick"] < one.first_tick) | (table["session_tick"] > one.last_tick)]
-        return table
-
-
-def table_dtype(end: End, wire: WireSpec) -> np.dtype[np.void]:
-    """Columns of a trace's rows, with 64 bits for ticks and times, and `wall`."""
-    rows = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
-    wide = {"tick", "session_tick", "answered", "received", "sent"}
-    names = rows.names or ()
-    return np.dtype([*((name, np.dtype(np.int64) if name in wide else rows[name]) for name in names), ("wall", "<i8")])
+        filled += header.rows
+    if end == "plant":
+        table["answered"][table["answered"] == NEVER] = NO_TICK
+    return table, states, len(batches) - len(fitting)
 
 
 def join(
@@ -200,3 +200,43 @@ def _places(ticks: Integers, places: npt.NDArray[np.intp], k: Integers) -> Place
         return np.full(len(k), -1, dtype=np.int32)
     at = np.minimum(np.searchsorted(ticks, k), len(ticks) - 1)
     return np.where(ticks[at] == k, places[first][at], -1).astype(np.int32)
+
+
+class TrueStates:
+    """Collects the true states of some sessions of a vehicle, by name with the number of motors."""
+
+    def __init__(self, actuators: Mapping[str, int]) -> None:
+        self._actuators = actuators
+        self._states: dict[str, dict[int, tuple[float, ...]]] = {session: {} for session in actuators}
+        self._signals: dict[str, dict[str, dict[int, float]]] = {session: {} for session in actuators}
+
+    def add(self, data: bytes) -> None:
+        """Add a message, unless it is of another session; of a tick, the first counts.
+
+        Raises:
+            ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
+        """
+        truth = Truth.model_validate_json(data)
+        if truth.session is None or truth.session not in self._actuators or (k := truth.session_tick) is None:
+            return
+        signals = self._signals[truth.session]
+        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[truth.session]:
+            raise ValueError("a true state of no tick of its session")
+        if len({*signals, *truth.signals}) > MAX_SIGNALS:
+            raise ValueError("more signals than a plant has")
+        self._states[truth.session].setdefault(k, (k, *truth.attitude, *truth.rate, *truth.voltages))
+        for name, value in truth.signals.items():
+            signals.setdefault(name, {}).setdefault(k, nan if value is None else value)
+
+    def rows(self, session: str) -> Array:
+        """Tick, q, ω and the motors' voltages, ascending. Shape (n, 8 + actuators)."""
+        rows = [row for _, row in sorted(self._states[session].items())]
+        return np.array(rows, np.float64).reshape(-1, 8 + self._actuators[session])
+
+    def signals(self, session: str) -> dict[str, Array]:
+        """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
+        ticks = sorted(self._states[session])
+        return {
+            name: np.array([values.get(k, nan) for k in ticks])
+            for name, values in sorted(self._signals[session].items())
+        }

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from math import nan
 from typing import Any, Final, Literal, NamedTuple, Self
 
@@ -27,7 +28,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.evaluation import configured_gains
 from aeroloop.service.control.laws.registry import law_of
-from aeroloop.service.logs.recording import Progress, ReviewError, check_memory
+from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 
 Flags = npt.NDArray[np.bool_]
@@ -36,9 +37,6 @@ Codes = npt.NDArray[np.int16] | Array
 
 AT_A_TIME: Final = 8192
 """Rows that are turned into Python's objects at a time."""
-
-_BYTES_PER_TICK: Final = 600
-"""Memory that a recomputed tick takes, with what is computed in between."""
 
 WINDOW: Final = 512
 """Ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second."""
@@ -61,9 +59,8 @@ class Ticks(NamedTuple):
         voltages: What was commanded; NaN where nothing was, or no valid value [V].
         unquantized: u before quantization [V].
         gains: The law's gains, one beside the other.
-        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad].
-        state_next: The same after the tick; of the paper's law the sign of the equilibrium approached. Where the
-            controller computed nothing, of the law's own state at the last tick that it did.
+        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad] and the sign of the equilibrium.
+        state_next: The same after the tick. Where the controller computed nothing, that of the last tick that it did.
     """
 
     k: Integers
@@ -178,88 +175,74 @@ def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = Non
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     """Compute a session again: what the controller computed, and at the other ticks the errors that the plant measured.
 
-    Raises:
-        ReviewError: It takes more memory than there is.
-        LawError, PluginError: As of `Controller`.
+    Raises LawError or PluginError as `Controller` does.
     """
     wire, controller, plant = session.settings.wire, session.controller, session.plant
     at, at_plant = session.at_controller, session.at_plant
-    check_memory(_BYTES_PER_TICK * len(session.k), len(session.k))
     sent_as, received_as = _column(controller, at, "sent_as"), _column(controller, at, "received_as")
     by_plant = _column(plant, at_plant, "sent_as") == Sent.FRAME
     by_controller = (at_plant < 0) & (received_as == Received.FRAME)
     frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
-    measurements = codes_in(wire.measurement, frames)
-    commands = codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]])
     answered = np.isin(sent_as, (Sent.FRAME, Sent.SILENT)) | (session.acted >= 0)
     until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
+    table, widths, missed = _computed(session, progress)
+    valid = ~np.isnan(table[:until, widths[0]])  # where q was measured
+    judged: slice | Integers = slice(until) if valid.all() else np.flatnonzero(valid)  # a slice copies nothing
     wall, sent, latency, there, back, offset_ns = _timed(session)
     volts = _voltages(session)
-    columns, missed = _computed(session, progress)
-    valid = ~np.isnan(columns[1][:until, 0])  # where q was measured
-    judged: slice | Integers = slice(until)  # of most sessions all ticks are valid: a slice copies nothing
-    if not valid.all():
-        judged = np.flatnonzero(valid)
-        for column in columns:
-            column[: len(judged)] = column[judged]
-    k, wall, sent = (column[judged] for column in (session.k, wall, sent))
-    latency, there, back, voltages = (column[judged] for column in (latency, there, back, volts))
-    state, attitude, after, desired, rate, attitude_error, rate_error, unquantized = (c[: len(k)] for c in columns)
-    commanded_at = slice(until) if answered[:until].all() else answered
+    columns = [np.asarray(part) for part in np.split(table[judged], np.cumsum(widths)[:-1], axis=1)]
+    state, q, state_next, desired, rate, attitude_error, rate_error, unquantized = columns
+    k, gains = session.k[judged], _gains(session, session.k[judged])
     return Recomputed(
         ticks=Ticks(
-            k, wall, sent, latency, there, back, attitude, desired, rate, attitude_error, rate_error,
-            voltages, unquantized, _gains(session, k), state, after,
+            k, wall[judged], sent[judged], latency[judged], there[judged], back[judged], q, desired, rate,
+            attitude_error, rate_error, volts[judged], unquantized, gains, state, state_next,
         ),
-        answered=session.k[commanded_at],
-        voltages=volts[commanded_at],
+        answered=session.k[answered],
+        voltages=volts[answered],
         missed=session.k[missed[missed < until]],
         unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int((sent_as == Sent.SILENT).sum())),
-        measurements=measurements,
-        commands=commands,
+        measurements=codes_in(wire.measurement, frames),
+        commands=codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]]),
         offset_ns=offset_ns,
     )  # fmt: skip
 
 
-def _computed(session: Session, progress: Progress | None) -> tuple[list[Array], Integers]:
+def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[int], Integers]:
     """What was computed at each tick, and the places of ticks that the plant measured and the controller did not.
 
-    The columns are the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u. Shapes (n, …).
+    A row has the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u, of these widths. Shape (n, sum).
     """
     logged = LoggedController(session)
-    outputs, last = logged.controller.outputs, logged.controller.last_valid
+    outputs = logged.controller.outputs
     names = list(outputs)[: list(outputs).index("u") + 1]
-    widths = [len(last["state_next"]), *(len(outputs[name]) for name in names)]
-    ends = np.cumsum(widths).tolist()
-    table = np.full((len(session.k), ends[-1]), nan)
-    memory, row_bytes, state_bytes = table.reshape(-1).view(np.uint8).data, 8 * ends[-1], 8 * ends[0]
-    found, state = logged.controller.row[: ends[-1] - ends[0]].cast("B"), last["state_next"].cast("B")
-    measured, computed = outputs["measured"], outputs["computed"]
+    state, row = np.asarray(logged.controller.last_valid["state_next"]), np.asarray(logged.controller.row)
+    widths = [len(state), *(len(outputs[name]) for name in names)]
+    columns = dict(zip(names, pairwise(np.cumsum(widths).tolist()), strict=True))
+    table = np.full((len(session.k), sum(widths)), nan)
+    row = row[: sum(widths[1:])]
 
     places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
     over = np.isin(_column(session.plant, session.at_plant, "sent_as"), (Sent.NONE, -1), invert=True)
-    failed: list[int] = []
-    state_before = bytearray(state_bytes)
+    state_before = np.empty_like(state)
+    u = slice(*columns["u"])
     inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
     for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
         logged.resume(i)
         state_before[:] = state
         if logged.answer(tick, received_as, frame) is not None and place >= 0:
             over[place] = False
-            if measured[0]:
-                at = place * row_bytes
-                memory[at : at + state_bytes] = state_before
-                memory[at + state_bytes : at + row_bytes] = found
-                if not computed[0]:
-                    failed.append(place)
+            if outputs["measured"][0]:
+                table[place, : len(state)] = state_before
+                table[place, len(state) :] = row
+                if not outputs["computed"][0]:
+                    table[place, u] = nan
     missed = np.flatnonzero(over)
-    columns = [np.asarray(part) for part in np.split(table, ends[:-1], axis=1)]
-    _compute_missed(session, missed, dict(zip(names, columns[1:], strict=True)))
-    columns[-1][missed] = nan
-    columns[-1][failed] = nan
-    return columns, missed
+    _compute_missed(session, missed, {name: table[:, a:b] for name, (a, b) in columns.items()})
+    table[missed, u] = nan
+    return table, widths, missed
 
 
 def _compute_missed(session: Session, missed: Integers, columns: dict[str, Array]) -> None:
@@ -345,20 +328,18 @@ def commanded(
 def codes_in(kind: FrameFormat, frames: npt.NDArray[np.void]) -> Codes:
     """Codes of well-formed frames, as `unpack` returns them, contiguous in memory per signal. Shape (n, codes)."""
     octets = np.ascontiguousarray(frames).view(np.uint8).reshape(len(frames), kind.size)
-    # A code starts within a byte and spans at most 16 bits, or 64 for a double; zeros pad the end.
-    columns = np.zeros((kind.size + 9, len(frames)), dtype=np.uint8)
-    columns[: kind.size] = octets.T
     codes: npt.NDArray[Any] = np.empty((len(kind.widths), len(frames)), np.float64 if None in kind.widths else np.int16)
     at = kind.first_bit
     for i, width in enumerate(kind.widths):
-        byte, bit = divmod(at, 8)
+        size = width or 64
+        bits = np.unpackbits(octets[:, at // 8 : (at + size + 7) // 8], axis=1)[:, at % 8 : at % 8 + size]
         if width is None:
-            first = np.ascontiguousarray(columns[byte : byte + 8].T).view(">u8")[:, 0].astype(np.uint64)
-            codes[i] = (first << bit | columns[byte + 8] >> (8 - bit)).view(np.float64)
+            codes[i] = np.packbits(bits, axis=1).view(">f8")[:, 0]
         else:
-            a, b, c = columns[byte : byte + 3].astype(np.int32)
-            codes[i] = (a << 24 | b << 16 | c << 8) << bit >> (32 - width)  # two's complement: the sign fills
-        at += 64 if width is None else width
+            weights = 1 << np.arange(width)[::-1]
+            weights[0] *= -1  # two's complement
+            codes[i] = bits.astype(np.int16) @ weights.astype(np.int16)
+        at += size
     return codes.T
 
 
@@ -372,6 +353,15 @@ def levels(signal: SignalSpec, codes: Codes) -> Array:
 def _levels(signal: SignalSpec) -> Array | None:
     quantizer = signal.quantizer()
     return np.array(quantizer.levels) if isinstance(quantizer, CodedQuantizer) else None
+
+
+def euler_deg(q: Array) -> Array:
+    """Roll, pitch and yaw in degrees as `aeroloop.protocol.wire.attitude.to_euler` has them. Shape (n, 4) to (n, 3)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.asarray(np.degrees(np.column_stack((roll, pitch, yaw))))
 
 
 # ── Times ──

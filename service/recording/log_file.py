@@ -21,12 +21,11 @@ from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
-TRACE_ENCODING: Final = "x-aeroloop-trace"
 _TRACE: Final = Shape(
     "aeroloop.Trace",
-    TRACE_ENCODING,
+    "x-aeroloop-trace",
     b"batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description",
-    TRACE_ENCODING,
+    "x-aeroloop-trace",
 )
 
 
@@ -80,7 +79,10 @@ class LogFile:
         Returns:
             Whether a chunk is full and waits for `commit`.
         """
-        channel = self._channels.get(received.key) or self._channel(received.key, _shape_of(received.key))
+        if (channel := self._channels.get(received.key)) is None:
+            topic = address.topic if (address := topics.read_key(received.key)) else None
+            shape = json_shape(topic.model) if topic and topic.model else None
+            channel = self._channel(received.key, _TRACE if topic and topic.kind == "trace" else shape)
         number = received.number & 0xFFFF_FFFF
         self._writer.add_message(channel, at_ns, received.payload, received.published_ns, number)
         for one in decoded:
@@ -135,11 +137,3 @@ class LogFile:
     def abandon(self) -> None:
         """Close the file as it is on the disk; drop what is not written."""
         self._file.close()
-
-
-def _shape_of(key: str) -> Shape | None:
-    """Shape of a key's raw messages; None if they have none."""
-    topic = address.topic if (address := topics.read_key(key)) else None
-    if topic is None or topic.model is None:
-        return _TRACE if topic and topic.kind == "trace" else None
-    return json_shape(topic.model)

@@ -5,7 +5,8 @@ restarted or was cut off recovers the last minute, the newest messages first: a 
 second it takes the received messages and writes them, so log times are exact to 0.5 s. A channel per key holds the raw
 payloads, decoded channels are written at a bounded rate, and losses are published and recorded.
 
-A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches. One that is stopped first
+A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches. While the disk refuses,
+nothing is taken: messages wait where they are received, and then in their caches. A recorder that is stopped first
 takes what caches still hold.
 """
 
@@ -30,12 +31,9 @@ if TYPE_CHECKING:
 
 WORK_EVERY_S: Final = 0.5  # messages can wait: a chunk is closed only once a second
 STATUS_EVERY_S: Final = 1.0
+DECODED_HZ: Final = 10.0  # of each decoded channel beside the raw messages; `log export --format mcap` has all
 AT_ONCE: Final = 2000  # messages written before anything else is done: the service manager expects a status
 END_S: Final = 8.0  # longest time for what caches hold when recording ends; a service manager kills after 10
-
-WAITING_BYTES: Final = 200_000_000
-"""Of messages that wait while the disk refuses, with `OVERHEAD` for each; the newest that find no room are lost."""
-OVERHEAD: Final = 600
 
 
 class Recorder:
@@ -43,22 +41,19 @@ class Recorder:
 
     def __init__(self, role: Node, settings: RecorderSettings) -> None:
         self.log = RollingLog(settings, self._report)
-        self.waiting: deque[tuple[Delivery, int]] = deque()  # taken and not yet written, with times of arrival
+        self._waiting: deque[tuple[Delivery, int]] = deque()  # taken and not yet written, with times of arrival
         self._role = role
-        self._waiting_bytes = 0
-        self._refused: Counter[str] = Counter()  # messages for which there was no room, by key
         self._lost: Counter[LossReason] = Counter()
         self._unreachable: list[str] = []  # traces of which nothing is received as recording ends
         self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
         self._status_at, self._status_written = time.monotonic(), 0
         self._decoder: Decoder | None = None
-        if settings.decoded_hz:
-            try:
-                from aeroloop.service.viewers.channels import Decoder
+        try:
+            from aeroloop.service.viewers.channels import Decoder
 
-                self._decoder = Decoder(settings.decoded_hz)
-            except ModuleNotFoundError:
-                role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
+            self._decoder = Decoder(DECODED_HZ)
+        except ModuleNotFoundError:
+            role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
         self._subscribers = [RecoveringSubscriber(role.zenoh, topics.key(name, "*")) for name in topics.RECORDED]
 
     def run(self) -> None:
@@ -74,18 +69,18 @@ class Recorder:
                     self._publish_status()
                     status_due = time.monotonic() + STATUS_EVERY_S
                 self.log.tend()
-                pause_s = WORK_EVERY_S if self._complete() else SOON_S
+                pause_s = WORK_EVERY_S if self._complete() or self.log.trouble else SOON_S
                 stopped = self._role.stop.wait(0.0 if self._behind else pause_s)
         finally:
             self._end()
 
     def _end(self) -> None:
         """Take what caches hold for at most `END_S`, name what is lost, and close the log with the last status."""
+        self.log.tend(at_once=True)
         begun = time.monotonic()
-        while not self._complete(begun) and time.monotonic() < begun + END_S:
+        while not (self._complete(begun) or self.log.trouble or time.monotonic() > begun + END_S):
             self._work()
             time.sleep(0.0 if self._behind else SOON_S)
-        self.log.tend(at_once=True)
         for subscriber in self._subscribers:
             for key, age_s in subscriber.silent().items():
                 if "/trace/" in key:
@@ -97,7 +92,7 @@ class Recorder:
         self._publish_losses(losses)
         self._publish_status()
         self._work_off()
-        self.log.close(len(self.waiting))
+        self.log.close(len(self._waiting))
 
     # ── messages ──
 
@@ -107,17 +102,17 @@ class Recorder:
     @property
     def _behind(self) -> bool:
         """Whether messages wait and the disk accepts them."""
-        return not self.log.trouble and len(self.waiting) > 0
+        return not self.log.trouble and len(self._waiting) > 0
 
     def _work(self) -> None:
-        """Take the received messages, unless older ones can be written first, and write some of the oldest."""
-        if not self._behind:
+        """Take the received messages, unless older ones are to be written first, and write some of the oldest."""
+        if not self._waiting:
             self._take()
         self._write(AT_ONCE)
 
     def _work_off(self) -> None:
         self._take()
-        self._write(len(self.waiting))
+        self._write(len(self._waiting))
 
     def _take(self) -> None:
         now_ns = time.time_ns()
@@ -125,38 +120,31 @@ class Recorder:
             for received in subscriber.take():
                 address = topics.read_key(received.key)
                 if address is not None and address.topic.name == "description":
-                    self._configure(received)  # at once: other messages are decoded by it
-                size = len(received.payload) + OVERHEAD
-                if not self.log.trouble or self._waiting_bytes + size <= WAITING_BYTES:
-                    self.waiting.append((received, now_ns))
-                    self._waiting_bytes += size
-                else:
-                    self._refused[received.key] += 1
+                    self._describe(received)
+                self._waiting.append((received, now_ns))
 
     def _write(self, most: int) -> None:
         """Write the oldest messages, unless the disk refuses."""
         for _ in range(most):
             if not self._behind:
                 return
-            received, at_ns = self.waiting.popleft()
-            self._waiting_bytes -= len(received.payload) + OVERHEAD
+            received, at_ns = self._waiting.popleft()
             address, decoded = topics.read_key(received.key), list[Decoded]()
             if self._decoder is not None and address is not None:
                 decoded = self._decoder.take(address, received.payload, received.published_ns)
             self.log.add(received, at_ns, decoded)
 
-    def _configure(self, received: Delivery) -> None:
+    def _describe(self, received: Delivery) -> None:
+        """Put a role's newest description into the log's metadata."""
         if received.published_ns < self._described.get(received.key, 0):
             return  # recovered after a newer one
         try:
-            description = Description.decode(received.payload)
+            Description.decode(received.payload)
         except MessageError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
         self._described[received.key] = received.published_ns
         self.log.add_description(received.key, received.payload)
-        if self._decoder is not None:
-            self._decoder.configure(description)
 
     # ── reports ──
 
@@ -164,10 +152,7 @@ class Recorder:
         return [loss for each in self._subscribers for loss in each.losses(finished=finished)]
 
     def _publish_losses(self, losses: list[Loss]) -> None:
-        """Publish, and thereby record, losses; those of the disk once it accepts writes again."""
-        if not self.log.trouble:
-            losses += [Loss(key=key, count=count, reason="disk") for key, count in self._refused.items()]
-            self._refused.clear()
+        """Publish, and thereby record, losses."""
         for loss in losses:
             self._lost[loss.reason] += loss.count
             self._role.publish("loss", loss)
@@ -184,8 +169,6 @@ class Recorder:
         now, written = time.monotonic(), self.log.written
         notes = [f"{count} messages lost: {LOSS_REASONS[reason]}" for reason, count in sorted(self._lost.items())]
         notes += self._unreachable
-        if self.log.trouble:
-            notes.append(f"{len(self.waiting)} messages wait in memory")
         state = STOPPED if self._role.stop.is_set() else NOT_RECORDING if self.log.trouble else "recording"
         rate_hz = (written - self._status_written) / max(now - self._status_at, 1e-3)
         self._role.status(Status(

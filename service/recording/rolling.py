@@ -10,21 +10,31 @@ from __future__ import annotations
 import errno
 import json
 import re
+import struct
 import time
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
+from mcap.exceptions import McapError
+from mcap.records import Metadata
+from mcap.stream_reader import StreamReader
+
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import RECORDER_METADATA, opening
+from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
 
+CHUNK_S: Final = 1.0
+"""A chunk is written this often: the most that a crash or a power cut costs [s]."""
+MAX_FILE_S: Final = 3600.0
+"""A new file begins after this time: what a viewer opens at once [s]."""
 RETRY_S: Final = 1.0
 REMIND_S: Final = 60.0
 """How often a fault that lasts is reported again [s]."""
@@ -71,9 +81,9 @@ class RollingLog:
         self.trouble = ""
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
-        place = settings.path or settings.directory
-        self._base = log_path(place, _BY_TIME)
-        self._runs = re.escape(self._base.stem) if self._base == place else r"aeroloop-\d{8}-\d{6}"  # that are ours
+        self._base = log_path(settings.path, _BY_TIME)
+        ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
+        self._runs = re.compile(ours)
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
@@ -110,7 +120,7 @@ class RollingLog:
         """Do what is due: write the chunk, retry the disk, begin a new file. If `at_once`, retry before it is due."""
         now = self._clock()
         if now >= self._due or (at_once and self.trouble):
-            self._due = now + self.settings.chunk_s
+            self._due = now + CHUNK_S
             self._write()
 
     def close(self, waiting: int = 0) -> None:
@@ -157,7 +167,7 @@ class RollingLog:
             self._report(f"recording again to {self.path}", False)
         elif gone:
             self._report(f"{last} was moved or removed while it was written", True)
-        if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= self.settings.max_file_s:
+        if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= MAX_FILE_S:
             try:
                 self._next_file()
             except OSError as error:
@@ -240,9 +250,9 @@ class RollingLog:
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file's metadata name this run or, if runs are named by the time, any run so named."""
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            head = opening(path)
-            if head is not None and head.name == RECORDER_METADATA:
+        with suppress(OSError, McapError, struct.error, ValueError, KeyError, TypeError), path.open("rb") as file:
+            _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
+            if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                return run["part"] == path.stem and re.fullmatch(self._runs, run["run"]) is not None
+                return run["part"] == path.stem and self._runs.fullmatch(run["run"]) is not None
         return False

@@ -20,8 +20,7 @@ from aeroloop.protocol.messages.models import LOSS_REASONS, Event, Loss, Status
 from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
-from aeroloop.service.logs.session import Array, Integers, Session, SessionKey
-from aeroloop.service.logs.table import TrueStates
+from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, TrueStates
 from aeroloop.service.review.report import FaultInterval, Mark
 
 MAX_MARKS: Final = 300

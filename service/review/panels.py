@@ -16,8 +16,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.session import Array, Integers
-from aeroloop.service.logs.table import euler_deg
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.ticks import Ticks, euler_deg
 from aeroloop.service.review.events import Truths
 from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel

@@ -225,7 +225,7 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 ADDRESSES: Final = (
-    "network.", "recorder.path", "recorder.directory", "can.channel", "can.node", "can.options.",
+    "network.", "recorder.path", "can.channel", "can.node", "can.options.",
     "plant.quanser.card_identifier", "plant.state_directory",
 )  # fmt: skip
 """Keys that only say where something is."""

@@ -31,7 +31,7 @@ LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration 
 """Why a session in lockstep has no durations."""
 
 OWN_AFFAIRS: Final = (
-    "loop.realtime", "loop.priority", "loop.cpus", "loop.trace_s", "plant.via", "plant.faults", "plant.fault_seed"
+    "loop.realtime", "loop.cpus", "plant.via", "plant.faults", "plant.fault_seed"
 )  # fmt: skip
 """Keys that each end has for itself, or that a command sets at the plant alone."""
 

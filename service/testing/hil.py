@@ -90,7 +90,6 @@ class Hil:
             "network.mode": "peer",
             "recorder.path": str(log),
             "recorder.max_file_mb": 1e6,  # a test reads one file
-            "recorder.max_file_s": 1e6,
             "controller.require_recorder": True,
             "controller.after_restart": "configured",
             "loop.lockstep": self._lockstep,

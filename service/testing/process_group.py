@@ -32,7 +32,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status, Telemetry
 from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.transport.network import join
-from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.network_settings import PORTS
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 
@@ -103,21 +103,20 @@ def _follow_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def free_rendezvous() -> str:
+def free_rendezvous(protocol: Literal["tcp", "tls"] = "tcp") -> str:
     """A loopback endpoint with free ports from it on, which no other call returns while this process lives.
 
     Why a UDP socket: it reserves the block against other processes that look for one, and leaves its TCP ports free.
     """
-    ports = NetworkSettings().ports
     while True:
-        first = randrange(10_000, 32_000, ports)  # noqa: S311  # no secret; below those that the system gives out
+        first = randrange(10_000, 32_000, PORTS)  # noqa: S311  # no secret; below those that the system gives out
         reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with suppress(OSError):
             reservation.bind(("127.0.0.1", first))
-            for port in range(first, first + ports):
+            for port in range(first, first + PORTS):
                 socket.create_server(("127.0.0.1", port)).close()
             reservation.detach()  # stays bound until this process ends
-            return f"tcp/127.0.0.1:{first}"
+            return f"{protocol}/127.0.0.1:{first}"
         reservation.close()
 
 

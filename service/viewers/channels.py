@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import degrees, nan, sqrt
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
+import numpy as np
 from foxglove import messages as foxglove
 from pydantic import BaseModel, ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Event, Loss, Status, Telemetry, Truth
-from aeroloop.protocol.messages.operator import Message, Setpoint
+from aeroloop.protocol.messages.operator import Message, MessageError, Setpoint
 from aeroloop.protocol.messages.trace import Sent, read_batch
 from aeroloop.protocol.wire import attitude
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -87,28 +88,36 @@ class Decoder:
         self._slot_ns = 0 if rate_hz is None else max(1, round(1e9 / rate_hz))
         self._slots: dict[tuple[str, str], int] = {}
         self._wires: dict[str, _Wire] = {}
+        self._described: dict[tuple[str, str], int] = {}  # when each role's newest description was published
 
-    def configure(self, description: Description) -> None:
+    def configure(self, description: Description, published_ns: int = 0) -> None:
         """Decode a vehicle's frames by this description from now on; before the first, frames and rows are dropped.
 
         A controller's is used until there is a plant's: the plant decides which frames it accepts. Other roles' are
-        ignored: a recorder's configuration need not match the wire.
+        ignored, as a recorder's configuration need not match the wire; so is one that is older than the last.
         """
-        known = self._wires.get(description.vehicle)
+        known, which = self._wires.get(description.vehicle), (description.vehicle, description.role)
         of_plant = known is not None and known.role == "plant"
+        if published_ns < self._described.get(which, 0):
+            return
         if description.role == "plant" or (description.role == "controller" and not of_plant):
             try:
                 self._wires[description.vehicle] = _Wire(description)
+                self._described[which] = published_ns
             except (ValidationError, KeyError, TypeError):
                 self.malformed += 1
 
     def take(self, address: topics.Address, payload: bytes, published_ns: int) -> list[Decoded]:
         """Decode a message, a frame or a batch of a trace, published at a time [ns since 1970].
 
-        Nothing if it is not due, malformed, or not shown, or if a frame says that nothing has changed.
+        Nothing if it is not due, malformed, or not shown, or if a frame says that nothing has changed. A description
+        configures the decoder.
         """
         vehicle, topic, wire = address.vehicle, address.topic, self._wires.get(address.vehicle)
         try:
+            if topic.name == "description":
+                self.configure(Description.decode(payload), published_ns)
+                return []
             if topic.kind == "trace":
                 return self._rows(vehicle, wire, payload)
             if topic.kind == "frame":
@@ -121,7 +130,7 @@ class Decoder:
                 return []
             message = topic.model.model_validate_json(payload)
             return _encoded(vehicle, _converted(message, address, wire, published_ns), published_ns)
-        except (ValueError, OverflowError):  # a stranger may publish anything, such as 1e999
+        except (ValueError, OverflowError, MessageError):  # a stranger may publish anything, such as 1e999
             self.malformed += 1
             return []
 
@@ -237,14 +246,9 @@ def _voltages(wire: _Wire, codes: Sequence[float]) -> BaseModel:
 
 def _product(p: attitude.Quaternion, q: attitude.Quaternion) -> attitude.Quaternion:
     """Hamilton product p ⊗ q."""
-    a, b, c, d = p
-    w, x, y, z = q
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
+    (a, *v), (b, *u) = p, q
+    x, y, z = (a * np.array(u) + b * np.array(v) + np.cross(v, u)).tolist()
+    return a * b - float(np.dot(v, u)), x, y, z
 
 
 def _timestamp(at_ns: int) -> foxglove.Timestamp:
@@ -269,59 +273,52 @@ def _posed(prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> _Show
 
 # ── the 3-D scene: two rotors on a beam over a stand for the Aero, a box with a nose otherwise ──
 
-_Triple = tuple[float, float, float]
-_Part = tuple[float, float, _Triple, _Triple, bool]
-"""Place along x and z [m], size [m], red, green and blue, and whether it lies on its side."""
+
+class _Part(NamedTuple):
+    x: float  # place along the frame's axes [m]
+    z: float
+    size: tuple[float, float, float]  # [m]
+    color: tuple[float, float, float]  # red, green and blue
+    kind: Literal["box", "disc", "disc on its side"] = "box"
+
 
 _BEAM, _NOSE, _TAIL = (0.35, 0.38, 0.42), (0.85, 0.2, 0.15), (0.15, 0.4, 0.75)  # red points forward
-_AERO_BOXES: Final[list[_Part]] = [(0.0, 0.0, (0.36, 0.03, 0.03), _BEAM, False)]
-_AERO_ROTORS: Final[list[_Part]] = [
-    (0.18, 0.0, (0.14, 0.14, 0.02), _NOSE, False),
-    (-0.18, 0.0, (0.14, 0.14, 0.02), _TAIL, True),
-]
-_AERO_STAND: Final[list[_Part]] = [
-    (0.0, -0.17, (0.04, 0.04, 0.3), _BEAM, False),
-    (0.0, -0.33, (0.3, 0.3, 0.02), _BEAM, False),
-]
-_BODY_BOXES: Final[list[_Part]] = [
-    (0.0, 0.0, (0.3, 0.2, 0.1), _BEAM, False),
-    (0.17, 0.0, (0.04, 0.1, 0.05), _NOSE, False),
-]
+_AERO: Final = (
+    _Part(0.0, 0.0, (0.36, 0.03, 0.03), _BEAM),
+    _Part(0.18, 0.0, (0.14, 0.14, 0.02), _NOSE, "disc"),
+    _Part(-0.18, 0.0, (0.14, 0.14, 0.02), _TAIL, "disc on its side"),
+)
+_STAND: Final = (
+    _Part(0.0, -0.17, (0.04, 0.04, 0.3), _BEAM, "disc"),
+    _Part(0.0, -0.33, (0.3, 0.3, 0.02), _BEAM, "disc"),
+)
+_BODY: Final = (_Part(0.0, 0.0, (0.3, 0.2, 0.1), _BEAM), _Part(0.17, 0.0, (0.04, 0.1, 0.05), _NOSE))
 
 
 def _scene(vehicle: str, kind: str, at_ns: int) -> foxglove.SceneUpdate:
-    """The body, a transparent copy at the desired attitude, and the stand, each fixed to its frame.
-
-    `kind` is `plant.kind`.
-    """
-    desired, aero = f"{vehicle}_desired", kind == "aero"
-    boxes, rotors = (_AERO_BOXES, _AERO_ROTORS) if aero else (_BODY_BOXES, [])
-    entities = [
-        _entity(vehicle, f"{vehicle} body", boxes, rotors, 1.0, at_ns),
-        _entity(desired, f"{desired} desired", boxes, rotors, 0.25, at_ns),
-    ]
-    if aero:
-        entities.append(_entity(WORLD, f"{vehicle} stand", [], _AERO_STAND, 1.0, at_ns))
-    return foxglove.SceneUpdate(entities=entities)
+    """The body, a transparent copy at the desired attitude, and the Aero's stand, each fixed to its frame."""
+    body, desired = _AERO if kind == "aero" else _BODY, f"{vehicle}_desired"
+    entities = [(vehicle, f"{vehicle} body", body, 1.0), (desired, f"{desired} desired", body, 0.25)]
+    if kind == "aero":
+        entities.append((WORLD, f"{vehicle} stand", _STAND, 1.0))
+    return foxglove.SceneUpdate(entities=[_entity(*entity, at_ns) for entity in entities])
 
 
-def _entity(
-    frame: str, name: str, boxes: list[_Part], cylinders: list[_Part], alpha: float, at_ns: int
-) -> foxglove.SceneEntity:
-    def placed(part: _Part) -> dict[str, Any]:
-        x, z, (length, width, height), (red, green, blue), on_its_side = part
-        turned = foxglove.Quaternion(x=sqrt(0.5), w=sqrt(0.5)) if on_its_side else foxglove.Quaternion(w=1.0)
-        return {
-            "pose": foxglove.Pose(position=foxglove.Vector3(x=x, z=z), orientation=turned),
+def _entity(frame: str, name: str, parts: Sequence[_Part], alpha: float, at_ns: int) -> foxglove.SceneEntity:
+    cubes, cylinders = list[foxglove.CubePrimitive](), list[foxglove.CylinderPrimitive]()
+    for part in parts:
+        aside = foxglove.Quaternion(x=sqrt(0.5), w=sqrt(0.5))
+        turned = aside if part.kind == "disc on its side" else foxglove.Quaternion(w=1.0)
+        (length, width, height), (red, green, blue) = part.size, part.color
+        placed: dict[str, Any] = {
+            "pose": foxglove.Pose(position=foxglove.Vector3(x=part.x, z=part.z), orientation=turned),
             "size": foxglove.Vector3(x=length, y=width, z=height),
             "color": foxglove.Color(r=red, g=green, b=blue, a=alpha),
         }
-
+        if part.kind == "box":
+            cubes.append(foxglove.CubePrimitive(**placed))
+        else:
+            cylinders.append(foxglove.CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **placed))
     return foxglove.SceneEntity(
-        timestamp=_timestamp(at_ns),
-        frame_id=frame,
-        id=name,
-        frame_locked=True,
-        cubes=[foxglove.CubePrimitive(**placed(part)) for part in boxes],
-        cylinders=[foxglove.CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **placed(part)) for part in cylinders],
+        timestamp=_timestamp(at_ns), frame_id=frame, id=name, frame_locked=True, cubes=cubes, cylinders=cylinders
     )

@@ -10,24 +10,21 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from itertools import chain
 from threading import Event
 from typing import Final
 
 import foxglove
 import zenoh
-from zenoh.handlers import RingChannel
+from zenoh.handlers import Handler, RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description
-from aeroloop.protocol.messages.operator import MessageError
-from aeroloop.protocol.transport.history import RecoveringSubscriber, read_sample
+from aeroloop.protocol.transport.history import Delivery, RecoveringSubscriber, read_sample
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.viewers.channels import SHAPES, Decoder, topic_of
 from aeroloop.service.viewers.schemas import Decoded, Shape
-
-log: Final = logging.getLogger("aeroloop")
 
 ROOM: Final = 1024
 """Events, losses or statuses that may wait to be taken; of streaming topics, one message."""
@@ -37,36 +34,6 @@ BACKLOG: Final = 256
 
 class FoxgloveServerError(AeroloopError):
     """The server cannot be started; one line with the reason and a remedy."""
-
-
-class LiveDecoder:
-    """Decodes what is published about a vehicle. The session is open, and must outlive the decoder."""
-
-    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
-        self._decoder = Decoder(None)  # the rate of `take` bounds it
-        self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
-        self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
-        shown = [topic for topic in topics.TOPICS.values() if topic.decoded or topic.kind == "frame"]
-        rooms = {topics.key(topic.name, vehicle): ROOM if topic.decoded == "always" else 1 for topic in shown}
-        self._rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
-
-    def take(self) -> Iterator[Decoded]:
-        """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
-        for description in self._descriptions.take():
-            if description.published_ns < self._described.get(description.key, 0):
-                continue  # recovered after a newer one
-            self._described[description.key] = description.published_ns
-            try:
-                self._decoder.configure(Description.decode(description.payload))
-            except MessageError:
-                log.warning("live: %s carries no description of this version", description.key)
-        for ring, room in self._rings:
-            for _ in range(room):
-                if (sample := ring.try_recv()) is None:
-                    break
-                received = read_sample(sample)
-                if address := topics.read_key(received.key):
-                    yield from self._decoder.take(address, received.payload, received.published_ns)
 
 
 class FoxgloveServer:
@@ -128,9 +95,23 @@ def serve(
         FoxgloveServerError: The address or port cannot be listened on.
         NetworkError: The network cannot be joined.
     """
+    decoder = Decoder(None)  # what is taken is bounded
+    shown = [topic for topic in topics.TOPICS.values() if topic.decoded or topic.kind == "frame"]
+    rooms = {topics.key(topic.name, vehicle): ROOM if topic.decoded == "always" else 1 for topic in shown}
     with FoxgloveServer(vehicle, address, port) as outlet, join(network, listen=False) as session:
-        feed = LiveDecoder(session, vehicle)
+        descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
+        rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
         ready(outlet.url)
         while not stop.wait(1 / rate_hz):
-            for message in feed.take():
-                outlet.send(message)
+            for received in chain(descriptions.take(), *(_taken(ring, room) for ring, room in rings)):
+                if topic := topics.read_key(received.key):
+                    for message in decoder.take(topic, received.payload, received.published_ns):
+                        outlet.send(message)
+
+
+def _taken(ring: zenoh.Subscriber[Handler[zenoh.Sample]], room: int) -> Iterator[Delivery]:
+    """What waits in a ring: of a streaming topic the newest message, of another all."""
+    for _ in range(room):
+        if (sample := ring.try_recv()) is None:
+            return
+        yield read_sample(sample)

@@ -142,7 +142,7 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     assert 2 <= flaws.opened - opened <= 2 + (time.monotonic() - lost_at) / 0.5
     assert sum("trying again" in record.getMessage() for record in caplog.records) == 1
     flaws.lost = flaws.gone = False
-    assert bus.side.reopen()
+    bus.until("the reopening", bus.side.reopen)
     bus.send_heartbeat(PlantState.IDLE)
     bus.await_heartbeat(PlantState.TRIPPED, 7)  # mended, it says what happened
     bus.begin(number=2)

@@ -49,10 +49,10 @@ def make(name: str) -> None:
     with TemporaryDirectory() as folder:
         if settings.get("plant.via") == "can":
             words = ("demo", "--lockstep", "--duration", "8", "--set", "plant.via=can")
-            aeroloop(*words, "--set", "recorder.decoded_hz=0", "--log", f"{folder}/can.mcap")
+            aeroloop(*words, "--log", f"{folder}/can.mcap")
         else:
             with Hil(Path(folder), lockstep=True) as hil:
-                hil.start(settings={"recorder.decoded_hz": 0, **settings})
+                hil.start(settings=settings)
                 hil.run(4)
                 hil.set_gains(C2=(0.2, 0.2, 0.2))
                 hil.run(1)

@@ -16,6 +16,7 @@ from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message,
 from aeroloop.protocol.transport.network_settings import SecuritySettings
 from aeroloop.service.host.operator import OperatorError, gather, stop
 from aeroloop.service.testing.hil import Hil
+from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.certified_link import open_session
 from tests.support.processes import PATIENT
@@ -29,7 +30,7 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
     for role, vehicle in (("plant", "aero"), ("controller", "aero"), ("recorder", None), ("operator", None)):
         ours.issue(role, vehicle)
     foreign.issue("operator")
-    keys = {"network.security.directory": str(ours.folder), "network.loopback_secured": True}
+    keys = {"network.security.directory": str(ours.folder), "network.rendezvous": free_rendezvous("tls")}
     hil.start(settings={**PATIENT, **keys})
     network = hil.settings.network
 
@@ -43,7 +44,8 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
 
     hil.eventually("the status of all", well)
     for security in (network.security.model_copy(update={"directory": str(foreign.folder)}), SecuritySettings()):
-        stranger = network.model_copy(update={"security": security, "loopback_secured": security.folder is not None})
+        met = network.rendezvous if security.folder else [network.rendezvous[0].replace("tls", "tcp")]
+        stranger = network.model_copy(update={"security": security, "rendezvous": met})
         assert stop(stranger).answers == []
         with pytest.raises(OperatorError, match="not of this authority" if security.folder else "no role answers"):
             gather(stranger)
@@ -89,7 +91,8 @@ def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: 
     ours = Authority(tmp_path)
     for role in ("plant", "controller", "recorder", "operator"):
         ours.issue(role, "aero")
-    hil.start(settings={**PATIENT, "network.security.directory": str(ours.folder), "network.loopback_secured": True})
+    keys = {"network.security.directory": str(ours.folder), "network.rendezvous": free_rendezvous("tls")}
+    hil.start(settings={**PATIENT, **keys})
     hil.eventually("a status of each", lambda: hil.state("controller") == "running")
     running = hil.status("controller").session
     assert running is not None

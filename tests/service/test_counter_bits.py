@@ -45,10 +45,9 @@ def test_in_lockstep_any_counter_will_do() -> None:
     assert load(overrides=["wire.counter_bits=4", "loop.lockstep=true"]).wire.counter_bits == 4
 
 
-def test_a_short_counter_is_accepted_on_a_can_bus_that_allows_it_and_nowhere_else() -> None:
-    short = ("wire.counter_bits=4", "can.short_counter=true")
-    assert load(overrides=["plant.via=can", *short]).wire.counter_bits == 4
-    with pytest.raises(ConfigError, match=r"set it to 7$"):
-        load(overrides=short)
-    with pytest.raises(ConfigError, match=r"set it to 7, or can\.short_counter = true accepts it$"):
-        load(overrides=["plant.via=can", "wire.counter_bits=4"])
+def test_a_short_counter_is_accepted_on_a_can_bus_whose_frame_holds_no_longer_one_and_nowhere_else() -> None:
+    ten_bits = ("wire.attitude.bits=10", "wire.rate.bits=10", "wire.counter_bits=4")
+    assert load(overrides=["plant.via=can", *ten_bits]).wire.counter_bits == 4
+    for others in (ten_bits, ["plant.via=can", "can.fd=true", *ten_bits], ["plant.via=can", "wire.counter_bits=4"]):
+        with pytest.raises(ConfigError, match=r"set it to 7$"):
+            load(overrides=others)

@@ -9,7 +9,6 @@ import pytest
 
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import sent_vector
-from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service import examples
@@ -19,7 +18,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
 
-COUNTERS = 1 << DEFAULT_COUNTER_BITS
+COUNTERS = 1 << 8
 
 PERIOD = 0.002
 DURATION = 1.5

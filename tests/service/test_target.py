@@ -23,13 +23,13 @@ def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
     file = tmp_path / "config.toml"
     file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n')
     monkeypatch.setenv("AEROLOOP_LAW__NONE", "1")
-    monkeypatch.setenv("AEROLOOP_NETWORK__PORTS", "3")
-    found = load_target(file, ["network.lease_ms=200", "plant.vai=can"])
-    assert (found.vehicle, found.network.ports, found.network.lease_ms) == ("beta", 3, 200)
+    monkeypatch.setenv("AEROLOOP_NETWORK__MODE", "client")
+    found = load_target(file, ["network.insecure=true", "plant.vai=can"])
+    assert (found.vehicle, found.network.mode, found.network.insecure) == ("beta", "client", True)
 
 
 @pytest.mark.parametrize(
-    "given", ["netwrok.ports=3", "network.prots=3", "vehicle=a/b", "network.ports=0", "lop=1", "x.y=1"]
+    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "lop=1", "x.y=1"]
 )
 def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
     with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):

@@ -96,7 +96,7 @@ def measurement(*values: float | None) -> bytes:
 
 def batch(end: End, rows: list[tuple[int, Sent, bytes]], wire: WireSpec = WIRE) -> bytes:
     """A batch with rows of times [ns since 1970], what was sent, and the frame that was; the other frame is zero."""
-    writer = TraceWriter(end, wire, 1, 10**8)
+    writer = TraceWriter(end, wire, 1)
     writer.session = "s1"
     ahead_ns = NOW - 10**12  # of the wall clock to the monotonic clock
     for tick, (at_ns, sent_as, frame) in enumerate(rows):

@@ -138,7 +138,7 @@ class ControllerEnd:
         run: int = RUNS["controller"],
     ) -> None:
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
-        self.trace = TraceWriter("controller", settings.wire, run, round(settings.loop.trace_s * 1e9))
+        self.trace = TraceWriter("controller", settings.wire, run)
         self.trace.session = session
         self._messages, self._clock, self._period = messages, clock, settings.loop.period
         self.trace.state = self.controller.state.model_dump(mode="json")
@@ -302,7 +302,7 @@ def made(
 
     plant_clock.now_ns = at_ns
     trace = PlantTrace(
-        loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n, plant_clock
+        wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n, plant_clock
     )
     claim = Claim(
         controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire

@@ -123,7 +123,7 @@ class Loop:
             patch.setattr(node, "join", lambda *_: self.network)
             self.role = LonelyNode("controller", "aero", NetworkSettings(), {}, name="controller-7", clock=self.clock)
         self.configured = reference
-        self.trace = TraceWriter("controller", WIRE, 1, 10**8)
+        self.trace = TraceWriter("controller", WIRE, 1)
         configured = Settings(law=LAW, reference=reference, controller=settings, wire=WIRE)
         self.live = OperatorChanges(self.role, configured, self.trace, lambda: "controller-7 does not have aero")
         self.live.serve()

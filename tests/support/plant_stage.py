@@ -103,7 +103,7 @@ class Stage(PlantNetwork):
         self.endpoint = self.driver.endpoint
         self.wires = Wires(lambda frame: answer(self, frame))
         self._published: deque[bytes] = deque()
-        self.trace = PlantTrace(loop, wire, self._published.append, run=RUN)
+        self.trace = PlantTrace(wire, self._published.append, run=RUN)
         self._between, self._skip = between, skip
         self._claims = 0
         self._ends = 0

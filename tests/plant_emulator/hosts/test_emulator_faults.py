@@ -48,7 +48,7 @@ class Run(Stage):
                 stage.claim()
             between(stage)
 
-        loop = LoopSettings(realtime="off", lockstep=lockstep, trace_s=10)
+        loop = LoopSettings(realtime="off", lockstep=lockstep)
         plant = PlantSettings(faults=list(faults))
         super().__init__(loop, WIRE, plant, between=before, answer=lambda stage, frame: stage.command(frame, (1, -1)))
         self.wires = RecordedWires(self.wires.answer)

@@ -26,7 +26,7 @@ TICKS = 60
 
 def stage_of(kind: str, wire: WireSpec, own: dict[str, Any], faults: list[str], *, lockstep: bool) -> Stage:
     """An emulator with a plant of one's own, whose every measurement is answered at once with rising and falling u."""
-    loop = LoopSettings(lockstep=lockstep, realtime="off", trace_s=0.01)
+    loop = LoopSettings(lockstep=lockstep, realtime="off")
     count = iter(range(TICKS * 10))
 
     def answer(stage: Stage, frame: bytes) -> None:
@@ -145,7 +145,7 @@ def _collector_off() -> Iterator[None]:
 
 @pytest.mark.usefixtures("_collector_off")
 def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_without() -> None:
-    loop, wire, settings = LoopSettings(realtime="off", trace_s=10), WireSpec(actuators=1), PlantSettings(watchdog_s=10)
+    loop, wire, settings = LoopSettings(realtime="off"), WireSpec(actuators=1), PlantSettings(watchdog_s=10)
     driver = Driver(Cyclic(TurntableSettings(), loop.period), loop, wire, settings, stop := Event())
 
     def between(stage: Stage) -> None:

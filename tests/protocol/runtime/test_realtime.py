@@ -1,4 +1,4 @@
-"""Real-time set-up: what a loop needs is ready before its first tick."""
+"""Real-time set-up: what a loop needs is ready before its first tick, and no socket lingers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import errno
 import gc
 import json
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -107,3 +108,35 @@ def test_strict_names_what_is_refused_and_off_asks_for_nothing(
     system(monkeypatch, lambda _: 0)
     (line,) = prepare_process(LoopSettings(realtime="strict"))  # a strict process starts although idle CPUs may sleep
     assert "idle CPUs sleep" in line
+
+
+LINGERING = """
+import socket, struct, threading
+from aeroloop.protocol.runtime.realtime import no_linger
+
+def lingers():
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 10))
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        others = one.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE), one.getsockopt(socket.IPPROTO_TCP, 1)
+        print(struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0], *others)
+
+lingers()
+print(no_linger())
+lingers()
+thread = threading.Thread(target=lingers)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.skipif(
+    (platform.system(), platform.machine()) not in {("Linux", "x86_64"), ("Linux", "aarch64")},
+    reason="other systems have no such filter",
+)
+@pytest.mark.processes
+def test_no_socket_lingers_and_every_other_option_is_set() -> None:
+    """In a process of its own: the filter cannot be taken off."""
+    done = subprocess.run([sys.executable, "-c", LINGERING], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["1 1 1", "None", "0 1 1", "0 1 1"]

@@ -7,7 +7,7 @@ from hashlib import sha256
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import CanError, CanSettings, Heartbeat, check_widths, fingerprint
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec, flat
@@ -15,7 +15,6 @@ from tests.support.can_in_process import PAPER
 from tests.support.wires import wire_of
 
 PERIOD_NS = 2_000_000
-MARK = b"\1\2\3\4\5\6\7"
 
 
 @settings(max_examples=40)
@@ -27,26 +26,6 @@ def test_a_heartbeat_has_eight_bytes_as_specified_and_is_read_as_it_was_written(
     states = [PlantState.IDLE, PlantState.GRANTED, PlantState.DRIVEN, PlantState.TRIPPED]
     assert packed == bytes([number << 4 | states.index(state)]) + mark
     assert Heartbeat.unpack(packed, 5) == Heartbeat(state, number, mark, 5)
-
-
-def test_causes_are_numbered_as_in_the_specification() -> None:
-    causes = [
-        "no command in time",
-        "invalid command",
-        "attitude or rate envelope",
-        "voltage saturation",
-        "no valid measurement",
-        "operator's stop",
-        "controller gone",
-        "no answer in lockstep",
-        "bus lost",
-        "node lost",
-        "another plant of this name",
-        "plant failed",
-    ]
-    assert [TripCause(cause).number for cause in causes] == list(range(1, 13))
-    said = [Heartbeat(PlantState.TRIPPED, number, MARK).cause for number in range(16)]
-    assert said == [None, *causes, None, None, None]
 
 
 WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -96,9 +95,3 @@ def test_what_cannot_be_used_is_refused_in_one_line(kind: str, tmp_path: Path) -
     assert "\n" not in text
     for part in says:
         assert part in text
-
-
-def test_a_certificate_is_good_from_its_first_to_its_last_moment(tmp_path: Path) -> None:
-    authority = Authority(tmp_path / "keys")
-    authority.issue("plant", "aero", begins=-timedelta(seconds=1), ends=timedelta(minutes=1))
-    assert own_certificate(authority.folder, ("plant",), "aero").days_left > 0

@@ -32,13 +32,14 @@ def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
 def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[FrameSession, FrameSession]]:
     """A plant's, which listens, and a controller's, which is connected to it."""
     request.getfixturevalue("beyond")
-    settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
-    if request.param == "certificates":
+    secured = request.param == "certificates"
+    settings = NetworkSettings(rendezvous=[free_rendezvous("tls" if secured else "tcp")], insecure=True)
+    if secured:
         authority = Authority(tmp_path / "keys")
         for role in ("plant", "controller"):
             authority.issue(role, "aero")
         security = settings.security.model_copy(update={"directory": str(authority.folder)})
-        settings = settings.model_copy(update={"security": security, "loopback_secured": True})
+        settings = settings.model_copy(update={"security": security})
     plant, controller = FrameSession(settings, PLANT), FrameSession(settings, CONTROLLER)
     plant.listen()
     eventually("a link", lambda: bool(controller.connect(plant.endpoint)))

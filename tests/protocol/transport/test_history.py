@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -228,14 +227,6 @@ def test_what_cannot_be_reached_but_may_have_more_is_named_and_not_waited_for() 
     assert complete == [False, False, False, True, True, True]
 
 
-def test_a_plain_publisher_is_received_too_at_its_time_of_arrival() -> None:
-    made = Made(10)
-    made.receive_sample(SimpleNamespace(key_expr=KEY, payload=zenoh.ZBytes(b"plain"), attachment=None))
-    (received,) = made.subscriber.take()
-    assert received == Delivery(KEY, b"plain", 0, received.published_ns, None)
-    assert 0 <= time.time_ns() - received.published_ns < 10**10
-
-
 def test_what_waits_is_bounded_and_what_finds_no_room_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "WAITING_BYTES", 10_000)
     made = Made(1000, size=1000)
@@ -349,45 +340,6 @@ def test_a_subscriber_that_comes_late_or_again_gets_everything_that_is_kept_once
         assert before_ns <= stamps[0]
         assert stamps == sorted(stamps)
         session.close()
-
-
-def test_messages_published_while_a_link_is_set_up_do_not_hide_what_was_published_before(network: Gathering) -> None:
-    """The publisher is met by gossip, in the midst of a thousand messages a second."""
-    network.join()  # holds the rendezvous
-    publisher, over = CachedPublisher(network.join(), KEY, per_s=1000), threading.Event()
-
-    sent = 0
-
-    def publish() -> None:
-        nonlocal sent
-        while not over.wait(0.001):
-            publisher.put(b"")
-            sent += 1
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        eventually("a history", lambda: sent > 300)
-        subscriber = RecoveringSubscriber(network.join(), ANY)
-        received = collect(subscriber, 500)
-    finally:
-        over.set()
-        thread.join()
-    publisher.put(b"last")
-    while received[-1].payload != b"last" or len(received) <= received[-1].number:
-        received = collect(subscriber, len(received) + 1, received)
-    assert [each.number for each in received] == list(range(len(received)))
-    assert subscriber.losses() == []
-
-
-def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
-    keys = [f"aeroloop/aero/trace/{role}" for role in ("plant", "controller")]
-    for session in (network.join(), network.join()):
-        for key in keys:
-            CachedPublisher(session, key, per_s=1).put(b"")
-    received = collect(RecoveringSubscriber(network.join(), ANY), 4)
-    assert sorted(each.key for each in received) == sorted(2 * keys)
-    assert len({each.publisher for each in received}) == 4
 
 
 def test_a_slow_reader_of_pages_holds_up_no_thread_of_zenoh_s(

@@ -16,8 +16,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
 from aeroloop.protocol.runtime.host import listener, name_process
 from aeroloop.protocol.transport.network import command_session
-from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.probe import accepting
+from aeroloop.protocol.transport.network_settings import PORTS, NetworkError, NetworkSettings
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -87,8 +86,7 @@ def test_whichever_process_ends_a_newcomer_links_to_the_rest_and_takes_its_port(
 
 def test_more_processes_than_ports_link_by_gossip() -> None:
     with Gathering() as gathering:
-        settings = gathering.settings.model_copy(update={"ports": 2})
-        linked([gathering.join(settings) for _ in range(5)])
+        linked([gathering.join() for _ in range(PORTS + 2)])
 
 
 def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() -> None:
@@ -138,7 +136,7 @@ def one_line(error: BaseException) -> str:
 
 def test_a_port_held_by_another_program_is_passed_over() -> None:
     with Gathering() as gathering, rude_program() as port:
-        linked([gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1))])
+        linked([gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"]))])
         assert accepts(port)
 
 
@@ -155,17 +153,6 @@ def test_a_listen_endpoint_in_use_is_reported_in_one_line(protocol: str, kind: s
             assert f"--set network.listen='[\"{protocol}/127.0.0.1:0\"]'" in text
             assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
-
-
-def test_a_process_of_another_host_than_the_rendezvous_joins_by_udp_too() -> None:
-    """It cannot listen there, at any port."""
-    with Gathering() as gathering:
-        gathering.join(NetworkSettings(rendezvous=["udp/192.0.2.1:7447"], ports=1, insecure=True))
-
-
-def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
-    """Neither a name that is none, nor a closed port."""
-    assert accepting(["tcp/no-such-host.invalid:7447", f"tcp/127.0.0.1:{free_port()}"]) == []
 
 
 def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:

@@ -36,7 +36,6 @@ def of(authority: Authority) -> NetworkSettings:
         {
             "mode": "client",
             "rendezvous": f"tls/127.0.0.1:{free_port()}",
-            "loopback_secured": True,
             "security": {"directory": str(authority.folder), "vehicles": ["aero"]},
         }
     )
@@ -128,33 +127,12 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
     token.undeclare()
 
 
-def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
-    """On hosts of their own both stand in the rendezvous; here all addresses are this host's."""
-    first, second = (NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"]) for _ in range(2))
-    open_sessions.enter_context(closing(route(first, ROUTER)))
-    open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
-    near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
-    receives(Listener(near, WORD), far, b"over both", WORD)
-    with command_session(first.model_copy(update={"connect": second.rendezvous})) as here:
-        here.wait_for_links()
-        assert here.unanswered() == []  # it links to one of them, and the other is well
-
-
 def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
     mine = of(Authority(tmp_path / "ours"))
     theirs = of(Authority(tmp_path / "foreign")).model_copy(update={"rendezvous": mine.rendezvous})
     with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, command_session(theirs):
         pass
     assert "not of this authority" in one_line(caught.value)
-
-
-def test_a_second_router_cannot_listen_where_one_does(settings: NetworkSettings, open_sessions: ExitStack) -> None:
-    router = open_sessions.enter_context(closing(route(settings, ROUTER)))
-    client = open_sessions.enter_context(closing(join(settings)))
-    assert list(client.info.routers_zid()) == [router.zid()]
-    with pytest.raises(NetworkError) as caught:
-        route(settings, ROUTER)
-    assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
 
 
 def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(

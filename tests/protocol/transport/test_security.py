@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
+from aeroloop.protocol.transport.certificate import PLAIN_S, CertificateError, read_certificate, refusal
 from aeroloop.protocol.transport.network import command_session, join
 from aeroloop.protocol.transport.network_settings import (
     READER,
@@ -27,7 +27,6 @@ from aeroloop.protocol.transport.network_settings import (
     opened,
     protected,
 )
-from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.transport.zenoh_config import tls_config
 from aeroloop.service.config_sources import load_target
 from aeroloop.service.testing.process_group import free_rendezvous
@@ -41,25 +40,20 @@ BEYOND = ("tcp/10.0.0.1:1", "tcp/[fe80::1]:1?iface=eth0", "tcp/0.0.0.0:1", "tcp/
 
 @pytest.mark.parametrize("endpoint", [*HERE, *BEYOND, "udp/10.0.0.1:1", "ws/10.0.0.1:1", "tls/127.0.0.1:1"])
 def test_plain_text_leaves_this_host_only_where_that_is_written_down(endpoint: str) -> None:
-    """By settings of certificates, `insecure` and `loopback_secured`; None: refused."""
+    """By settings of certificates and `insecure`; None: refused."""
     here, tls = endpoint in HERE, endpoint.startswith("tls")
     as_tls = "tls" + endpoint.removeprefix("tcp") if endpoint.startswith("tcp") else None
-    local = endpoint if endpoint.startswith("unixsock") or tls else as_tls
-    for security in (SecuritySettings(), SecuritySettings(directory="/keys")):
-        for insecure, loopback_secured in product((False, True), repeat=2):
-            network = NetworkSettings(security=security, insecure=insecure, loopback_secured=loopback_secured)
-            expected: str | None
-            if security.directory:
-                expected = local if loopback_secured or not here else endpoint
-            elif tls or (loopback_secured and local != endpoint):
-                expected = None
-            else:
-                expected = endpoint if here or insecure else None
-            if expected is not None:
-                assert opened(endpoint, network) == expected
-            else:
-                with pytest.raises(NetworkError, match=r"network\.security\.directory|name a tcp or tls endpoint"):
-                    opened(endpoint, network)
+    for security, insecure in product((SecuritySettings(), SecuritySettings(directory="/keys")), (False, True)):
+        network = NetworkSettings(security=security, insecure=insecure)
+        if security.directory:
+            expected = endpoint if here or tls else as_tls
+        else:
+            expected = endpoint if here or (insecure and not tls) else None
+        if expected is not None:
+            assert opened(endpoint, network) == expected
+        else:
+            with pytest.raises(NetworkError, match=r"network\.security\.directory|name a tcp or tls endpoint"):
+                opened(endpoint, network)
 
 
 def test_plain_text_beyond_loopback_is_said_at_each_start(caplog: pytest.LogCaptureFixture) -> None:
@@ -76,7 +70,7 @@ def test_certificates_are_needed_only_where_a_link_uses_them(tmp_path: Path) -> 
     nowhere = NetworkSettings(security=SecuritySettings(directory=str(tmp_path)))
     assert protected(nowhere, PLANT) == (nowhere, None, ())
     with pytest.raises(CertificateError, match=r"ca\.pem is missing"):  # never the system's authorities
-        protected(nowhere.model_copy(update={"loopback_secured": True}), PLANT)
+        protected(nowhere.model_copy(update={"rendezvous": ["tls/127.0.0.1:7447"]}), PLANT)
 
 
 class Secured:
@@ -87,9 +81,8 @@ class Secured:
         for role, vehicle in (("plant", "aero"), ("controller", "aero"), ("operator", None)):
             self.authority.issue(role, vehicle)
         self.settings = NetworkSettings(
-            rendezvous=[free_rendezvous()],
+            rendezvous=[free_rendezvous("tls")],
             security=SecuritySettings(directory=str(self.authority.folder), vehicles=["aero"]),
-            loopback_secured=True,
         )
         self.place = protected(self.settings, PLANT).settings.rendezvous_endpoints[0]
 

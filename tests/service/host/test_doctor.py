@@ -67,7 +67,7 @@ def test_it_says_of_each_configured_place_whether_a_process_answers_and_which_ce
     for authority in (ours, foreign):
         authority.issue("operator")
         authority.issue("plant", "aero")
-    settings = NetworkSettings(rendezvous=[free_rendezvous()], ports=1, loopback_secured=True)
+    settings = NetworkSettings(rendezvous=[free_rendezvous("tls")])
 
     def of(authority: Authority) -> NetworkSettings:
         security = SecuritySettings(directory=str(authority.folder), vehicles=["aero"])

@@ -71,7 +71,7 @@ def test_a_range_of_whole_numbers_stays_whole_where_it_can_and_stands_among_othe
         (["wire.rate.bits=8,8"], "the same twice"),
         (["wire.rate.bits=8", "wire.rate.bits=9"], "gives wire.rate.bits twice"),
         (["plant.wind.seed=1,2"], "--seeds"),
-        (["recorder.chunk_s=1,2"], "law, loop, plant, reference, wire"),
+        (["recorder.max_file_mb=1,2"], "law, loop, plant, reference, wire"),
         (["wire.rate.limit=1..2*9999", "wire.attitude.limit=0.5..1*9999"], "at most"),
         (["wire.rate.limit=1e999999999..2*3"], "wire.rate.limit"),
         (["wire.rate.kind*=2"], "factors are numbers"),

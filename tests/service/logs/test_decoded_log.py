@@ -6,8 +6,6 @@ import random
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
 from aeroloop.service.config import load
@@ -56,30 +54,3 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     assert review(tmp_path / "out.mcap").z_track == review(log).z_track
     with pytest.raises(ExportError, match="--session"):
         export([log], "mcap", tmp_path / "other.mcap", session=SESSION)
-
-
-def test_what_several_files_repeat_is_written_once_and_the_last_description_stays_the_last(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
-    make_log(log, 50)
-    description = next(iter(Recording([log]).descriptions.values()))
-    before, now = (description.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
-    (tmp_path / "run").mkdir()
-    for i, descriptions in enumerate([(now, before), (before, now), (now,)]):
-        with (tmp_path / "run" / f"{i}.mcap").open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            writer.add_attachment(1, 1, "protocol/SPEC.md", "text/markdown", b"the same")
-            for json in descriptions:
-                writer.add_metadata(DESCRIPTION_METADATA, {"key": "k", "json": json})
-            channel = writer.register_channel("other", "", writer.register_schema("s", "", b""))
-            writer.add_message(channel, i + 1, b"", i + 1, i)
-            writer.finish()
-    export([tmp_path / "run"], "mcap", tmp_path / "out.mcap")
-    with (tmp_path / "out.mcap").open("rb") as file:
-        reader = make_reader(file)
-        assert [one.metadata["json"] for one in reader.iter_metadata()] == [now, before, now, now]
-        assert len(list(reader.iter_attachments())) == 1
-        summary = reader.get_summary()
-        assert summary is not None
-        assert (len(summary.schemas), len(summary.channels)) == (1, 1)
-    assert [message.sequence for message in by_mcap(tmp_path / "out.mcap")] == [0, 1, 2]

@@ -155,7 +155,7 @@ def test_a_second_session_has_its_own_gains_and_reference(tmp_path: Path) -> Non
 def test_a_batch_has_the_record_once_a_second_and_a_long_one_less_often() -> None:
     wire = load().wire
     for points, least_s in ((1, RECORD_S), (600, 2.0)):
-        writer = TraceWriter("plant", wire, 1, 10**8)
+        writer = TraceWriter("plant", wire, 1)
         writer.session = "s"
         change = Change(session="s", tick=7, gains=Gains(C1=tuple([0.3] * 3)), reference=AWAY)
         writer.record = record_json([change] * points)

@@ -227,7 +227,7 @@ def missing_of(kept: Collection[int]) -> list[str]:
     Each batch has 25 rows: 0 to 3 are of s1, 4 and 5 of s2, 6 to 9 of s3.
     """
     wire = WireSpec()
-    writer, index = TraceWriter("controller", wire, 7, 10**12), TraceIndex()
+    writer, index = TraceWriter("controller", wire, 7), TraceIndex()
     frames = bytes(wire.measurement.size), bytes(wire.command.size)
     batches = []
     for session, ticks in (("s1", 100), ("s2", 50), ("s3", 100)):

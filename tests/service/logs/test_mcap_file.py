@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import random
-import resource
 import struct
 import tracemalloc
-import zlib
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -22,26 +19,19 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.logs.copies import RecoverError, recover
-from aeroloop.service.logs.mcap_file import (
-    DESCRIPTION_METADATA,
-    MAX_CHUNK,
-    Damage,
-    messages,
-    opening,
-    records,
-)
+from aeroloop.service.logs.mcap_file import MAX_CHUNK, records
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import read as read_run
 from aeroloop.service.review.review import review
 from tests.support.made_log import AN_OPERATORS_WORDS, make_log
-from tests.support.mcap_parts import END, FOOTER, HEAD, Part, Read, by_mcap, chunks, parts
+from tests.support.mcap_parts import END, FOOTER, HEAD, Read, by_mcap, chunks, parts
 
 TICKS: Final = 600
 
 
-def read(path: Path, damages: list[Damage]) -> list[Read]:
+def read(path: Path, damages: list[str]) -> list[Read]:
     """Every message."""
     channels: dict[int, str] = {}
     found = []
@@ -52,6 +42,12 @@ def read(path: Path, damages: list[Damage]) -> list[Read]:
             topic = channels[record.channel_id]
             found.append(Read(topic, record.sequence, record.log_time, record.publish_time, record.data))
     return found
+
+
+def after(messages: list[Read]) -> str:
+    """Up to when these messages are, in words."""
+    last_ns = max(one.log_time for one in messages)
+    return f"after {datetime.fromtimestamp(last_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 @pytest.fixture(scope="module")
@@ -72,11 +68,9 @@ def everything(whole: Path) -> list[Read]:
 def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
     whole: Path, everything: list[Read], tmp_path: Path
 ) -> None:
-    damages: list[Damage] = []
+    damages: list[str] = []
     assert read(whole, damages) == everything
     assert damages == []
-    named = messages(whole, lambda channel: channel.topic.endswith("/telemetry") or None)
-    assert [one.data for _, one in named] == [one.data for one in everything if one.topic.endswith("/telemetry")]
     assert recover(whole, tmp_path / "out.mcap").lost == []
     assert by_mcap(tmp_path / "out.mcap") == everything
     assert Recording([tmp_path / "out.mcap"]).descriptions == Recording([whole]).descriptions
@@ -93,15 +87,15 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut_and_says_up_
     edges = (place + d for place in (*ends, data_end) for d in (-1, 0, 1))
     for size in {*(rng.randrange(8, len(data)) for _ in range(60)), *edges}:
         cut.write_bytes(data[:size])
-        damages: list[Damage] = []
+        damages: list[str] = []
         got = read(cut, damages)
         assert got == everything[: len(got)]
         assert len(got) > (sum(place <= size for place in ends) - 0.1) * of_chunk * 0.9
         assert len(damages) == (size < data_end)
         if damages and got:
-            assert damages[0].after_ns == max(one.log_time for one in got)
+            assert after(got) in damages[0]
         if got:
-            assert recover(cut, out).lost == list(map(str, damages))
+            assert recover(cut, out).lost == damages
             assert by_mcap(out) == got
             out.unlink()
         else:
@@ -122,7 +116,7 @@ def test_a_flipped_bit_anywhere_costs_one_chunk_at_most_and_nothing_unnamed(
         bent = bytearray(data)
         bent[bit // 8] ^= 1 << bit % 8
         flipped.write_bytes(bent)
-        damages: list[Damage] = []
+        damages: list[str] = []
         got = read(flipped, damages)
         lost = len(everything) - len(got)
         assert lost < 1.5 * of_chunk, f"bit {bit}"
@@ -138,23 +132,23 @@ def test_a_log_of_a_killed_recorder_is_read_up_to_the_damage(
     data = bytearray(whole.read_bytes()[:-END])
     damaged = chunks(whole.read_bytes())[5]
     data[(damaged.offset + damaged.end) // 2] ^= 0x10
-    killed, damages = tmp_path / "killed.mcap", list[Damage]()
+    killed, damages = tmp_path / "killed.mcap", list[str]()
     killed.write_bytes(data)
     got = read(killed, damages)
     assert got == everything[: len(got)] != []
-    assert [damage.offset for damage in damages] == [damaged.offset]
-    assert damages[0].after_ns == max(one.log_time for one in got)
-    assert recover(killed, tmp_path / "out.mcap").lost == list(map(str, damages))
+    (damage,) = damages
+    assert f"(byte {damaged.offset}, {after(got)})" in damage
+    assert recover(killed, tmp_path / "out.mcap").lost == damages
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(seed: int, tmp_path: Path) -> None:
-    """50 files each: cut, or with up to three bits flipped, some of them without their index."""
+    """30 files each: cut, or with up to three bits flipped, some of them without their index."""
     log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261201 + seed)
     make_log(log, 200, changes={120: AN_OPERATORS_WORDS[120]}, chunk_every=4, truth_every=20)
     data, clean, same = log.read_bytes(), read_run(log), replay([log])
     refused: list[str] = []
-    for _ in range(50):
+    for _ in range(30):
         bent = bytearray(data if rng.random() < 0.7 else data[: rng.randrange(len(data))])
         for _ in range(rng.randrange(4)):
             if bent:
@@ -172,7 +166,7 @@ def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_wo
             assert named
         if again.controller != same.controller or again.plant != same.plant:
             assert not again.complete or again.reasons
-    assert len(refused) < 25
+    assert len(refused) < 15
     assert all(len(line.splitlines()) == 1 for line in refused)
 
 
@@ -191,17 +185,6 @@ def test_what_is_no_log_or_stands_in_the_way_is_reported_in_one_line(whole: Path
         recover(tmp_path / "none.mcap", tmp_path / "out")
     with pytest.raises(OutputError, match="is an input"):
         recover(whole, whole)
-
-
-def test_what_a_full_disk_cut_short_is_removed(whole: Path, tmp_path: Path) -> None:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(OutputError, match=os.strerror(errno.EFBIG)):
-            recover(whole, tmp_path / "out.mcap")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_one_flipped_bit_in_a_description_is_named_and_changes_no_figure(whole: Path, tmp_path: Path) -> None:
@@ -252,7 +235,7 @@ LIES: Final[dict[str, Callable[[], bytes]]] = {
 
 @pytest.mark.parametrize("lie", LIES)
 def test_what_a_file_claims_costs_no_memory_and_is_damage(tmp_path: Path, whole: Path, lie: str) -> None:
-    path, damages = tmp_path / "lie.mcap", list[Damage]()
+    path, damages = tmp_path / "lie.mcap", list[str]()
     first = chunks(whole.read_bytes())[0].offset
     block = LIES[lie]()
     path.write_bytes(whole.read_bytes()[:first] + block)
@@ -260,45 +243,8 @@ def test_what_a_file_claims_costs_no_memory_and_is_damage(tmp_path: Path, whole:
     assert read(path, damages) == []
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert damages[0].offset == first
-    assert peak < 10 * len(block) + 1_000_000
-
-
-# The index
-
-
-def with_index(data: bytes, edit: Callable[[list[Part]], list[Part]]) -> bytes:
-    """The file with other records in its index, under a checksum that fits them."""
-    start, offsets, _ = FOOTER.unpack_from(data, len(data) - END + HEAD.size)
-    index = b"".join(part.bytes for part in edit(parts(data[start:-END])))
-    footer = data[-END : -END + HEAD.size] + struct.pack("<QQ", start, offsets)
-    return data[:start] + index + footer + struct.pack("<I", zlib.crc32(index + footer)) + data[-len(MAGIC) :]
-
-
-def without_a_chunk(index: list[Part]) -> list[Part]:
-    last = max(i for i, part in enumerate(index) if part.opcode == Opcode.CHUNK_INDEX)
-    return [*index[:last], *index[last + 1 :]]
-
-
-def with_a_chunk_elsewhere(index: list[Part]) -> list[Part]:
-    """The last chunk is said to begin where the file's header does."""
-    last = max(i for i, part in enumerate(index) if part.opcode == Opcode.CHUNK_INDEX)
-    content = bytearray(index[last].content)
-    struct.pack_into("<Q", content, 16, len(MAGIC))
-    return [*index[:last], index[last]._replace(content=bytes(content)), *index[last + 1 :]]
-
-
-def test_an_index_that_is_wrong_costs_at_most_what_it_points_away_from(
-    whole: Path, everything: list[Read], tmp_path: Path
-) -> None:
-    """Its checksum fits: only what it says of the file does not."""
-    path, data = tmp_path / "wrong.mcap", whole.read_bytes()
-    found = list[Damage]()
-    path.write_bytes(with_index(data, without_a_chunk))
-    assert (read(path, found), found) == (everything, [])
-    path.write_bytes(with_index(data, with_a_chunk_elsewhere))
-    assert len(read(path, found)) > len(everything) * (1 - 1.5 / len(chunks(data)))
-    assert [damage.offset for damage in found] == [len(MAGIC)]
+    assert f"(byte {first}" in damages[0]
+    assert peak < 10 * len(block) + MAX_CHUNK + 1_000_000
 
 
 def test_an_index_of_which_a_bit_flipped_is_not_used_and_costs_nothing(
@@ -310,14 +256,5 @@ def test_an_index_of_which_a_bit_flipped_is_not_used_and_costs_nothing(
         bent = bytearray(data)
         bent[bit // 8] ^= 1 << bit % 8
         path.write_bytes(bent)
-        damages: list[Damage] = []
+        damages: list[str] = []
         assert (read(path, damages), damages) == (everything, [])
-
-
-def test_the_record_behind_the_header_opens_the_file(whole: Path, tmp_path: Path) -> None:
-    head = opening(whole)
-    assert head is not None
-    assert head.name == DESCRIPTION_METADATA
-    for data in (b"", MAGIC, b"something else", whole.read_bytes()[:100]):
-        (tmp_path / "a.mcap").write_bytes(data)
-        assert opening(tmp_path / "a.mcap") is None

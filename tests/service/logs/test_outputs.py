@@ -71,8 +71,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("named", NAMES)
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    ("verb", "named"), [*((verb, "its own") for verb in VERBS), *(("recover", name) for name in NAMES)]
+)
 def test_no_verb_overwrites_a_log_by_any_name_and_not_with_force(
     here: Path, verb: str, named: str, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from math import inf
 from pathlib import Path
 
 import pytest
 
-from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
 from aeroloop.service.review.review import review
-from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, START_NS, lockstep, made, make_log, write
+from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, lockstep, made, make_log, write
 
 TICKS = 600
 
@@ -59,24 +57,6 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
     assert "details" not in both.model_dump()
 
 
-def test_a_part_is_replayed_by_its_times_and_names_what_is_missing_in_it_alone(tmp_path: Path) -> None:
-    """The plant's state is known at its first row only."""
-    messages = made(lockstep(), TICKS, spoil=321)
-    gone = [m for m in messages if m.key.endswith("trace/controller")][1]
-    log = write(tmp_path / "a.mcap", lockstep(), [m for m in messages if m != gone])
-    for times, differ, lacks in (((0.5, 0.75), 1, 0), ((0.8, inf), 0, 0), ((0.0, 0.4), 0, 1)):
-        both = replay([log], since_s=times[0], until_s=times[1])
-        (session,) = both.sessions
-        assert session.first_tick == times[0] / 0.002
-        assert (session.differ, len(both.missing), both.complete) == (differ, lacks, not lacks)
-        assert both.plant is None
-        assert "not in part" in both.reasons["plant"]
-    assert replay([log], since_s=0.5, until_s=0.75).controller == EndReplay(ticks=126, differ=1)
-    assert execute(["log", "replay", str(log), "--from", "0.8"]) == 0
-    assert execute(["log", "replay", str(log), "--to", "0.4"]) == 1
-    assert execute(["log", "replay", str(log), "--from", "2", "--to", "1"]) == 2
-
-
 def test_with_another_law_it_reports_what_would_have_been_commanded(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS)
     session = replayed(tmp_path / "a.mcap", "law.C2=[0.3, 0.3, 0.3]")
@@ -92,14 +72,3 @@ def test_the_figures_of_a_made_log_are_those_of_the_experiment(tmp_path: Path) -
     figures, expected = review(tmp_path / "a.mcap"), run_experiment(load(), TICKS * 0.002)
     assert (figures.z_track, figures.u_total) == (expected.z_track, expected.u_total)
     assert figures.damages == []
-
-
-def test_a_folder_is_read_as_one_run_in_the_order_of_time(tmp_path: Path) -> None:
-    """Two recorders by turns, whose file names sort the other way round; the second has the last 60 ticks again."""
-    messages = made(lockstep(), TICKS)
-    write(tmp_path / "b.mcap", lockstep(), [m for m in messages if m.at_ns < START_NS + 300 * 2_000_000])
-    write(tmp_path / "a.mcap", lockstep(), [m for m in messages if m.at_ns >= START_NS + 240 * 2_000_000])
-    (tmp_path / "whole").mkdir()
-    make_log(tmp_path / "whole" / "w.mcap", TICKS)
-    parts, whole = review(tmp_path), review(tmp_path / "whole")
-    assert (parts.z_track, parts.u_total, parts.duration_s) == (whole.z_track, whole.u_total, whole.duration_s)

@@ -148,16 +148,14 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller = load()
-    plant = load(
-        overrides=["plant.aero.mass=2.0", 'plant.faults=["rate:off@5"]', "law.C2=[9, 9, 9]", "loop.priority=7"]
-    )
-    recorder = load(overrides=["recorder.decoded_hz=50"])
+    plant = load(overrides=["plant.aero.mass=2.0", 'plant.faults=["rate:off@5"]', "law.C2=[9, 9, 9]", "loop.cpus=[0]"])
+    recorder = load(overrides=["recorder.max_file_mb=50"])
     its: Mapping[str, Settings] = {"plant": plant, "recorder": recorder}
     roles = ("controller", "plant", "recorder")
     path = write(tmp_path / "a.mcap", controller, made(controller, 100), roles=roles, its=its)
     shown = read(path).report()
     assert shown.settings["plant"] == plant.description()["plant"]
-    assert shown.settings["recorder"]["decoded_hz"] == 50
+    assert shown.settings["recorder"]["max_file_mb"] == 50
     assert shown.settings["law"] == controller.description()["law"]
     differ = [(one.key, one.controller, one.plant) for one in shown.findings.disagreements]
     assert differ == [("plant.aero.mass", controller.plant.aero.mass, 2.0)]

@@ -21,7 +21,6 @@ from aeroloop.protocol.transport.can_format import CanError, Heartbeat
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.viewers.dbc import dbc
-from tests.protocol.test_spec_document import FRAME_ROWS, Row, as_bits
 from tests.protocol.wire.test_frames import codes_of
 from tests.support.wires import specs
 
@@ -135,22 +134,6 @@ def test_any_codes_of_any_wire_decode(spec: WireSpec, data: st.DataObject) -> No
     for message, layout, of in frames(spec):
         counter = data.draw(st.integers(0, 2**spec.counter_bits - 1))
         assert_decodes(message, layout, of, counter, data.draw(codes_of(layout.widths)))
-
-
-@pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
-def test_the_golden_frames_of_the_spec_decode_to_their_codes(row: Row) -> None:
-    frame, counter_bits, bits, actuators, counter, codes, text = row
-    widths = [as_bits(cell.strip()) for cell in bits.split(",")]
-    changed: dict[str, object] = {"counter_bits": int(counter_bits)}
-    if frame == "measurement":
-        changed |= {"attitude": {"bits": widths[0], "limit": 1.0}, "rate": {"bits": widths[1], "limit": 1.0}}
-    else:
-        changed |= {"voltage": {"bits": widths[0], "limit": 24.0}, "actuators": int(actuators)}
-    message = read(WireSpec.model_validate(changed)).get_message_by_name(frame.capitalize())
-    payload = bytes.fromhex(text).ljust(message.length, b"\0")
-    raw = message.decode(payload, scaling=False, decode_choices=False)
-    assert isinstance(raw, dict)
-    assert [str(value).lower() for value in raw.values()] == [counter, *codes.lower().split()]
 
 
 @every_wire

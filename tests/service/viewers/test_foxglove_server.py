@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from itertools import count
 from math import degrees, radians
 from queue import Queue
@@ -27,7 +27,6 @@ from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveSer
 from aeroloop.service.viewers.schemas import Decoded
 from tests.support.decoded import NOW, RAW, STATUS, about, measurement, telemetry
 from tests.support.viewer_double import PATIENCE_S, Shown, Viewer, orientation
-from tests.support.zenoh_network import eventually
 
 TOPICS = {f"/aero/{name}" for name in SHAPES}
 
@@ -173,23 +172,6 @@ def await_subscribers(outlet: FoxgloveServer, viewer: Viewer) -> None:
     viewer.first("/aero/log")
     sent.set()
     sender.join()
-
-
-def test_a_stopped_server_closes_its_connections_and_frees_its_port(settings: Settings) -> None:
-    with ExitStack() as stack:
-        with serving(settings.network) as url:
-            viewer = stack.enter_context(Viewer(url))
-        viewer.await_closed()
-    port = int(url.rpartition(":")[2])
-
-    def is_free() -> bool:
-        try:
-            with FoxgloveServer("aero", "127.0.0.1", port) as outlet:
-                return outlet.url == url
-        except FoxgloveServerError:  # a connection of another process may come from this port for a moment
-            return False
-
-    eventually("serving on the same port again", is_free)
 
 
 def test_a_port_in_use_is_one_clear_line() -> None:

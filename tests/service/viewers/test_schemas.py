@@ -1,15 +1,19 @@
-"""Schemas of decoded channels: every topic is listed, its JSON is as its schema says, and viewers read it."""
+"""Schemas of decoded channels and the layout of panels: as topics are decoded, and such that viewers read them."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.cli.main import execute
 from aeroloop.service.viewers.channels import SHAPES
-from aeroloop.service.viewers.schemas import Attitude, Tracking, Voltages, json_shape, plain_schema
+from aeroloop.service.viewers.schemas import layout
 from tests.support.decoded import NOW, RAW, STATUS, address, configured, said
 from tests.support.viewer_double import fields
 
@@ -58,19 +62,64 @@ def test_every_schema_is_one_that_viewers_read() -> None:
         assert (package, message) in declared, name
 
 
-def test_fields_that_are_numbers_have_a_unit_in_their_names_or_count_something() -> None:
-    units = ("_deg", "_deg_s", "_v", "_s")
-    plain = {"damping_1", "damping_2", "damping_3", "sign"}
-    for view in (Attitude, Voltages, Tracking):
-        for name, field in plain_schema(view)["properties"].items():
-            assert field["type"] == "boolean" or name.endswith(units) or name in plain, name
+# ── layout ──
 
 
-@pytest.mark.parametrize("name", [topic.name for topic in topics.TOPICS.values() if topic.kind == "json"])
-def test_messages_of_the_network_can_be_described_so_that_viewers_read_them(name: str) -> None:
-    model = topics.TOPICS[name].model
-    assert model is not None
-    schema = plain_schema(model)
-    assert readable(schema)
-    assert set(schema["properties"]) == set(model.model_fields)
-    assert json.loads(json_shape(model).schema) == schema
+def made(vehicle: str = "aero", actuators: int = 2) -> dict[str, Any]:
+    tree: dict[str, Any] = json.loads(layout(vehicle, WireSpec(actuators=actuators).motors))
+    return tree
+
+
+def paths(tree: dict[str, Any]) -> list[str]:
+    return [path["value"] for panel in tree["configById"].values() for path in panel.get("paths", [])]
+
+
+def leaves(node: Any) -> Iterator[str]:
+    if isinstance(node, str):
+        yield node
+    else:
+        yield from leaves(node["first"])
+        yield from leaves(node["second"])
+
+
+@pytest.mark.parametrize("vehicle", ["aero", "bench.2"])
+def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
+    """A topic with a dot in it stands in quotes."""
+    found = paths(made(vehicle, 3))
+    for path in found:
+        parts = re.fullmatch(
+            r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
+        )
+        assert parts is not None, path
+        assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
+        assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
+    shown = {path.rpartition(".")[2] for path in found}
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "p99", "state"} <= shown
+
+
+def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws_and_every_panel_has_its_place() -> None:
+    panels = made()["configById"]
+    assert sorted(leaves(made()["layout"])) == sorted(panels)
+    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
+    assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
+    assert SHAPES["scene"].name == "foxglove.SceneUpdate"
+    assert (body["followTf"], body["followMode"]) == ("aero", "follow-position")
+    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
+    assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"
+
+
+def test_voltages_are_those_of_the_motors_there_are() -> None:
+    def volts(actuators: int) -> set[str]:
+        return {path.rpartition(".")[2] for path in paths(made("aero", actuators)) if "voltage" in path}
+
+    assert volts(2) == {"voltage_2_v", "voltage_3_v"}
+    for actuators in (1, 3, 8):
+        assert volts(actuators) == {f"voltage_{i + 1}_v" for i in range(actuators)}
+
+
+def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    assert execute(["show", "layout", "--set", "vehicle=bench", "--set", "wire.actuators=3"]) == 0
+    assert json.loads(capfd.readouterr().out) == made("bench", 3)
+    assert execute(["show", "layout", "--set", "vehicle=aero2"]) == 0
+    assert json.loads(capfd.readouterr().out) == made("aero2")
