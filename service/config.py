@@ -164,8 +164,10 @@ def from_description(config: dict[str, Any]) -> Settings:
     """The configuration in a role's description. Keys that this version does not have are left out.
 
     Raises:
-        ConfigError: This version cannot read it.
+        ConfigError: This version cannot read it, or a whole section is missing, as of what no role publishes.
     """
+    if missing := [name for name in Settings.model_fields if name not in config]:
+        raise ConfigError(f"a description without {', '.join(missing)}")
     settings = _valid(config, extra="ignore")
     if isinstance(settings.law, CustomLawSettings):  # keys of a user's law, which are not ours to know
         return settings.model_copy(update={"law": CustomLawSettings.model_validate(config["law"])})
