@@ -8,9 +8,7 @@ from itertools import accumulate
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -41,13 +39,6 @@ def rows(batches: list[Batch], column: str) -> list[object]:
 
 def operations(batches: list[Batch]) -> list[PlantChange]:
     return [operation for batch in batches for operation in batch.tail.operations]
-
-
-def inject(text: str) -> Callable[[Stage], None]:
-    def do(stage: Stage) -> None:
-        stage.driver.inject([Fault.parse(text)])
-
-    return do
 
 
 def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_took() -> None:
@@ -99,30 +90,6 @@ def test_a_row_holds_what_came_what_was_made_of_it_and_what_was_measured() -> No
         sent, received = batch.times_ns("sent"), batch.times_ns("received")
         assert (np.diff(sent) >= 0).all()
         assert ((received < sent) | (received == -1)).all()
-
-
-@pytest.mark.parametrize(
-    ("meddle", "cause"),
-    [
-        (inject("attitude:off"), TripCause.SENSORS),
-        (inject("command:off"), TripCause.COMMAND_TIMEOUT),
-        (
-            lambda stage: stage.wires.deliver(WIRE.command.pack(stage.endpoint.counter, (-32, 0)), 0),
-            TripCause.INVALID_COMMAND,
-        ),
-    ],
-    ids=["sensors", "commands lost", "invalid"],
-)
-def test_a_trip_is_the_sessions_last_row_with_its_cause(meddle: Callable[[Stage], None], cause: TripCause) -> None:
-    batches = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim, 40: meddle}), answer=answer).run(200).batches
-    *before, last = rows(batches, "trip")
-    assert set(before) == {0}
-    assert last == cause.number
-    assert len(before) < 190
-    assert rows(batches, "sent_as")[-1] == Sent.NONE
-    assert batches[-1].header.final
-    assert tuple(batches[-1].columns["voltages"][-1]) == OFF
-    assert rows(batches, "answered")[-1] == 0xFFFF_FFFF
 
 
 @pytest.mark.parametrize(
