@@ -91,7 +91,7 @@ class FakeQuanser:
     ) -> None:
         self.HIL: Callable[[], FakeHIL] = lambda: FakeHIL(self)
         self.card_type, self.period, self.realtime = card_type, period, realtime
-        self.calls: deque[str] = deque(maxlen=10_000)
+        self.calls: deque[str] = deque(maxlen=10_000)  # names of the last calls
         self._turns = COUNTS[card_type]
         sensors = {"attitude": "encoders", "counts": self._turns, "rate": "gyro"}
         sensing = settings.sensors.model_copy(update=sensors)

@@ -100,16 +100,6 @@ def is_nothing(seen: Measurement) -> bool:
     return all(isnan(value) for value in (*seen.attitude, *seen.rate))
 
 
-class Calls:
-    """Names of the calls to a board since this was made."""
-
-    def __init__(self, board: FakeQuanser) -> None:
-        self._board, self._before = board, len(board.calls)
-
-    def names(self) -> list[str]:
-        return list(self._board.calls)[self._before :]
-
-
 @pytest.fixture(autouse=True)
 def no_package() -> Iterator[None]:
     """Remove the fake package that a test has put in the place of Quanser's."""
@@ -157,9 +147,9 @@ def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_be
     assert board.task.samples.maxlen == 1
     period = ["task_read", "task_get_buffer_overflows", "watchdog_reload"]
     for expected in (["watchdog_start", "task_start", *period], period):
-        calls = Calls(board)
+        board.calls.clear()
         plant.advance()
-        assert calls.names() == expected
+        assert list(board.calls) == expected
 
 
 def test_a_board_that_was_left_under_an_expired_watchdog_is_had_again_at_0_v() -> None:
@@ -205,10 +195,10 @@ def test_closing_goes_on_when_a_step_fails(failing: str) -> None:
         board.unplug()
     elif failing != "none":
         board.fail_next(failing)
-    calls = Calls(board)
+    board.calls.clear()
     plant.close()
     plant.close()
-    assert calls.names() == [call for call in CLOSING if failing != "all" or call != "watchdog_stop"]  # once
+    assert list(board.calls) == [call for call in CLOSING if failing != "all" or call != "watchdog_stop"]  # once
     assert board.motor_voltages == (VOLTS if failing == "all" else OFF)
     assert board.holder is None
 
@@ -217,9 +207,9 @@ def test_the_watchdog_is_left_to_do_what_closing_could_not() -> None:
     plant, board = driven_plant()
     for call in ("write_analog", "write_digital"):
         board.fail_next(call)
-    calls = Calls(board)
+    board.calls.clear()
     plant.close()
-    assert "watchdog_stop" not in calls.names()
+    assert "watchdog_stop" not in board.calls
     assert board.watchdog is not None
 
 
@@ -283,7 +273,7 @@ def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the
     plant, board = driven_plant()
     plant.actuate(OFF)
     board.let_pass(WATCHDOG + 1)
-    calls = Calls(board)
+    board.calls.clear()
     plant.advance()
     assert is_nothing(plant.measure())
     assert plant.failure == "the board's watchdog expired"
@@ -291,21 +281,21 @@ def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the
     for _ in range(WATCHDOG):
         plant.advance()
     plant.amplify(False)
-    assert not any(call.startswith("write") for call in calls.names())
+    assert not any(call.startswith("write") for call in board.calls)
 
 
 def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_armed() -> None:
     plant, board = expired_plant()
-    calls = Calls(board)
+    board.calls.clear()
     for _ in range(5):
         drive(plant, 1)
         assert is_nothing(plant.measure())
         assert board.truth().voltages == OFF
-    assert not {"watchdog_clear", "write_analog", "write_digital"} & set(calls.names())
-    calls = Calls(board)
+    assert not {"watchdog_clear", "write_analog", "write_digital"} & set(board.calls)
+    board.calls.clear()
     drive(plant, 1, OFF)
     clearing = ["watchdog_stop", "watchdog_clear", "watchdog_start", "write_analog", "write_digital"]
-    assert calls.names()[:5] == clearing
+    assert list(board.calls)[:5] == clearing
     assert not is_nothing(plant.measure())
     assert board.truth().voltages == OFF  # though clearing restored the outputs of before
     drive(plant, 1)
@@ -335,9 +325,9 @@ def test_a_command_that_could_not_be_written_does_not_reload_the_watchdog() -> N
     plant, board = driven_plant()
     board.fail_next("write_analog")
     for reloads in (False, True):
-        calls = Calls(board)
+        board.calls.clear()
         drive(plant, 1)
-        assert ("watchdog_reload" in calls.names()) == reloads
+        assert ("watchdog_reload" in board.calls) == reloads
         assert not is_nothing(plant.measure())  # what it sees is true all the same
     assert plant.failures == 1
 
@@ -404,10 +394,10 @@ def test_a_gyros_rates_need_no_filter_and_its_axes_can_be_set() -> None:
 def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchdog() -> None:
     plant, board = driven_plant()
     board.fail_next("task_read")
-    calls = Calls(board)
+    board.calls.clear()
     drive(plant, 1)
     assert is_nothing(plant.measure())
-    assert "watchdog_reload" not in calls.names()
+    assert "watchdog_reload" not in board.calls
     drive(plant, 1)
     assert not is_nothing(plant.measure())
     assert plant.failures == 1
@@ -440,11 +430,12 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
         twin.advance()
     assert plant.measure().attitude == twin.measure().attitude
     assert plant.passed == 4
-    calls, now = Calls(board), board.time
+    board.calls.clear()
+    now = board.time
     for _ in range(3):  # periods that are over are not waited for
         plant.advance()
         assert is_nothing(plant.measure())
-    assert (calls.names(), board.time) == ([], now)
+    assert (list(board.calls), board.time) == ([], now)
     plant.advance()
     assert not is_nothing(plant.measure())
     assert (board.time, plant.passed) == (now + 1, 1)
