@@ -18,6 +18,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Grant, Release
 from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
@@ -45,6 +46,11 @@ class Ends:
         self._session = gathering.join()
         self.asker = Asker(self._session, LOOP.period_ns)
         self._session.declare_subscriber(topics.key("event", "aero"), self._on_event)
+        self.batches: list[Batch] = []
+        self._session.declare_subscriber(topics.key("trace", "aero", role="plant"), self._trace)
+        self.measured: list[bytes] = []
+        measured = topics.key("measurement", "aero")
+        self._session.declare_subscriber(measured, lambda sample: self.measured.append(sample.payload.to_bytes()))
         alive = threading.Event()
         token = topics.key("alive", "aero", role="plant")
         self._session.liveliness().declare_subscriber(token, lambda _: alive.set(), history=True)
@@ -94,6 +100,15 @@ class Ends:
     def _on_event(self, sample: zenoh.Sample) -> None:
         self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
 
+    def command(self, echo: int) -> None:
+        key = topics.key("command", "aero", session=self.asker.session)
+        self._session.put(key, WIRE.command.pack(echo, (3, -3)))
+
+    def _trace(self, sample: zenoh.Sample) -> None:
+        batch = read_batch(sample.payload.to_bytes())
+        assert batch is not None
+        self.batches.append(batch)
+
     def _beat(self) -> None:
         while not self._over.wait(0.1):
             self.node.beat(self._says)
@@ -121,6 +136,26 @@ def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:
     ends.hold()
     ends.role.stop.set()
     eventually("idle on the bus", lambda: ends.received_state() is PlantState.IDLE)
+
+
+def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed(ends: Ends) -> None:
+    ends.hold()
+    frames = [WIRE.measurement.pack(counter, (counter, 0, 0, 0, 0, 0)) for counter in range(10)]
+    for counter, frame in enumerate(frames):
+        ends.node.send(frame)
+        eventually("the measurement", lambda frame=frame: ends.measured[-1:] == [frame])  # type: ignore[misc]
+        ends.command(counter)
+        arrival = ends.node.wait(PATIENCE_S)
+        assert arrival is not None
+    assert ends.release()
+    eventually("the last batch", lambda: any(batch.header.final for batch in ends.batches))
+    rows = [batch for batch in ends.batches if batch.header.rows]
+    assert b"".join(batch.columns["measurement"].tobytes() for batch in rows) == b"".join(frames)
+    assert [tick for batch in rows for tick in batch.columns["session_tick"].tolist()] == [*range(10)]
+    assert [outcome for batch in rows for outcome in batch.columns["outcome"].tolist()] == [0] + [Outcome.ACTED] * 9
+    assert [answered for batch in rows for answered in batch.columns["answered"].tolist()] == [0xFFFF_FFFF, *range(9)]
+    kinds = [operation.kind for batch in ends.batches for operation in batch.tail.operations]
+    assert kinds == ["claim", "release"]
 
 
 @pytest.mark.parametrize(

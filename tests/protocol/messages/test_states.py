@@ -5,11 +5,14 @@ tests/plant_emulator/endpoint/test_freshness.py predicts every step of a plant e
 
 from __future__ import annotations
 
+import pytest
+
 from aeroloop.protocol.messages.states import (
     CONTROLLER_TABLE,
     PLANT_TABLE,
     ControllerState,
     ControllerTrigger,
+    Machine,
     PlantState,
     PlantTrigger,
 )
@@ -48,3 +51,10 @@ def test_a_controller_stands_down_from_any_state_and_has_a_vehicle_only_by_a_gra
         assert reached(state, without=ControllerTrigger.RECALL) <= aside
         assert CONTROLLER_TABLE[state, ControllerTrigger.RECALL] is ControllerState.SEARCHING
     assert not reached(ControllerState.SEARCHING, without=ControllerTrigger.GRANT) & driving
+
+
+def test_a_trigger_that_the_table_does_not_have_is_refused_and_changes_nothing() -> None:
+    machine = Machine(PlantState.IDLE, PLANT_TABLE)
+    with pytest.raises(ValueError, match=r"idle.*command"):
+        machine.fire(PlantTrigger.COMMAND)
+    assert machine.state is PlantState.IDLE
