@@ -177,6 +177,22 @@ def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
     assert bus.endpoint.trip is TripCause.HOLDER_GONE
 
 
+def test_another_number_is_another_session(bus: Bus) -> None:
+    bus.begin(number=3)
+    bus.drive()
+    bus.turn()
+    assert bus.plant.voltages != OFF
+    bus.stranger.everything()
+    bus.begin(number=4)
+    assert bus.endpoint.state is PlantState.GRANTED
+    bus.turn()
+    assert bus.plant.voltages == OFF
+    bus.await_heartbeat(PlantState.GRANTED)
+    seen = bus.counters(40)
+    start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
+    assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
+
+
 def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:
     bus.begin(number=1)
     bus.drive()
