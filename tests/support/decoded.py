@@ -8,8 +8,6 @@ from typing import Any
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
-    PROTOCOL_VERSION,
-    Description,
     Event,
     Loss,
     Percentiles,
@@ -28,6 +26,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.viewers.channels import Decoder
 from aeroloop.service.viewers.schemas import Decoded
+from tests.support.made_log import description
 
 NOW = 1_800_000_000_000_000_000
 SETTINGS = load()
@@ -57,29 +56,17 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 ATTITUDE = product(about(3, YAW), product(about(2, PITCH), about(1, ROLL)))
 
 
-def description(role: str = "plant", *overrides: str, vehicle: str = "aero") -> Description:
-    """A role's description, configured with these overrides."""
-    return Description(
-        protocol=PROTOCOL_VERSION,
-        role=role,
-        vehicle=vehicle,
-        host="h",
-        versions={},
-        config=load(None, overrides).description(),
-    )
-
-
-def address(name: str, role: str = "plant", vehicle: str = "aero") -> topics.Address:
+def address(name: str, role: str = "plant") -> topics.Address:
     """Where a message of this name was received."""
-    found = topics.read_key(topics.key(name, vehicle, session="s1", role=role))
+    found = topics.read_key(topics.key(name, "aero", session="s1", role=role))
     assert found is not None
     return found
 
 
-def configured(rate_hz: float | None = None, *overrides: str) -> Decoder:
+def configured(rate_hz: float | None = None) -> Decoder:
     """A decoder that knows the plant; at most so many messages of a topic a second."""
     decoder = Decoder(rate_hz)
-    decoder.configure(description("plant", *overrides))
+    decoder.configure(description(SETTINGS, "plant"))
     return decoder
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -65,27 +64,18 @@ def test_every_schema_is_one_that_viewers_read() -> None:
 # ── layout ──
 
 
-def made(vehicle: str = "aero", actuators: int = 2) -> dict[str, Any]:
-    tree: dict[str, Any] = json.loads(layout(vehicle, WireSpec(actuators=actuators).motors))
-    return tree
+def leaves(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
 
 
-def paths(tree: dict[str, Any]) -> list[str]:
-    return [path["value"] for panel in tree["configById"].values() for path in panel.get("paths", [])]
-
-
-def leaves(node: Any) -> Iterator[str]:
-    if isinstance(node, str):
-        yield node
-    else:
-        yield from leaves(node["first"])
-        yield from leaves(node["second"])
-
-
-@pytest.mark.parametrize("vehicle", ["aero", "bench.2"])
-def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
+@pytest.mark.parametrize(("vehicle", "actuators", "motors"), [("aero", 2, {2, 3}), ("bench.2", 3, {1, 2, 3})])
+def test_every_path_is_a_field_of_a_topic_that_is_decoded_and_voltages_are_those_of_the_motors_there_are(
+    vehicle: str, actuators: int, motors: set[int], capfd: pytest.CaptureFixture[str]
+) -> None:
     """A topic with a dot in it stands in quotes."""
-    found = paths(made(vehicle, 3))
+    assert execute(["show", "layout", "--set", f"vehicle={vehicle}", "--set", f"wire.actuators={actuators}"]) == 0
+    panels = json.loads(capfd.readouterr().out)["configById"].values()
+    found = [path["value"] for panel in panels for path in panel.get("paths", [])]
     for path in found:
         parts = re.fullmatch(
             r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
@@ -94,32 +84,17 @@ def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
         assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
         assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
     shown = {path.rpartition(".")[2] for path in found}
-    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "p99", "state"} <= shown
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "p99", "state"} <= shown
+    assert {field for field in shown if field.startswith("voltage")} == {f"voltage_{i}_v" for i in motors}
 
 
 def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws_and_every_panel_has_its_place() -> None:
-    panels = made()["configById"]
-    assert sorted(leaves(made()["layout"])) == sorted(panels)
+    made = json.loads(layout("aero", WireSpec().motors))
+    panels = made["configById"]
+    assert sorted(leaves(made["layout"])) == sorted(panels)
     (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
     assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
     assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
     assert SHAPES["scene"].name == "foxglove.SceneUpdate"
-    assert (body["followTf"], body["followMode"]) == ("aero", "follow-position")
     (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
     assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"
-
-
-def test_voltages_are_those_of_the_motors_there_are() -> None:
-    def volts(actuators: int) -> set[str]:
-        return {path.rpartition(".")[2] for path in paths(made("aero", actuators)) if "voltage" in path}
-
-    assert volts(2) == {"voltage_2_v", "voltage_3_v"}
-    for actuators in (1, 3, 8):
-        assert volts(actuators) == {f"voltage_{i + 1}_v" for i in range(actuators)}
-
-
-def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytest.CaptureFixture[str]) -> None:
-    assert execute(["show", "layout", "--set", "vehicle=bench", "--set", "wire.actuators=3"]) == 0
-    assert json.loads(capfd.readouterr().out) == made("bench", 3)
-    assert execute(["show", "layout", "--set", "vehicle=aero2"]) == 0
-    assert json.loads(capfd.readouterr().out) == made("aero2")
