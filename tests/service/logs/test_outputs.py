@@ -10,7 +10,7 @@ from typing import Final
 import pytest
 
 from aeroloop.service.cli.main import execute
-from aeroloop.service.logs.outputs import OutputError, check_output, writing, writing_into
+from aeroloop.service.logs.outputs import OutputError, check_output, writing
 from tests.support.made_log import make_log
 
 VERBS: Final[dict[str, tuple[str, ...]]] = {
@@ -114,22 +114,14 @@ def test_figures_are_drawn_all_or_none(
 
 
 def test_what_appears_meanwhile_is_not_overwritten(here: Path) -> None:
-    def log() -> None:
+    def write() -> None:
         with writing(here / "out", force=True) as part:
             part.write_bytes(b"new")
             (here / "out").write_bytes((here / "a.mcap").read_bytes())
 
-    def figure() -> None:
-        with writing_into(here / "folder") as folder:
-            (folder / "x").write_bytes(b"new")
-            (here / "folder" / "x").write_bytes(b"mine")
-
     with pytest.raises(OutputError, match="is a log"):
-        log()
-    with pytest.raises(OutputError, match="exists already"):
-        figure()
-    assert (here / "folder" / "x").read_bytes() == b"mine"
-    assert [path.name for path in (here / "folder").iterdir()] == ["x"]
+        write()
+    assert (here / "out").read_bytes() == (here / "a.mcap").read_bytes()
 
 
 def test_an_input_that_is_no_log_is_not_overwritten_either(here: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64decode
 from dataclasses import replace
-from html.parser import HTMLParser
+from html import unescape
 from json import loads
 from math import inf
 from typing import Any
@@ -20,25 +21,10 @@ from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, made_th
 BROKEN = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
 
 
-class Texts(HTMLParser):
-    """The texts of a page, outside of scripts and styles."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-        self.element = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, _attrs: object) -> None:
-        self.element = tag
-
-    def handle_data(self, data: str) -> None:
-        if self.element not in {"script", "style"} and data.strip():
-            self.texts.append(" ".join(data.split()))
-
-
 def texts_of(*reports: Report) -> list[str]:
-    return Texts(page(reports)).texts
+    """The texts of a page, outside of scripts and styles."""
+    texts = re.split(r"<(?:script|style)\b.*?</(?:script|style)>|<[^>]+>", page(reports), flags=re.DOTALL)
+    return [" ".join(unescape(text).split()) for text in texts if text.strip()]
 
 
 def with_findings(report: Report, **changes: Any) -> Report:

@@ -21,7 +21,7 @@ from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import LOCKSTEP, read
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
-from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, SESSION, START_NS, make_log
+from tests.support.made_log import AHEAD_NS, SESSION, START_NS, make_log
 
 
 def found(path: Path) -> Findings:
@@ -37,20 +37,6 @@ def event(at_s: float, role: str, kind: str, text: str, session: str | None = "s
     at_ns = START_NS + round(at_s * 1e9)
     published_ns = at_ns + (AHEAD_NS if role == "controller" else 0)
     return message_of("event", message, published_ns)._replace(recorded_ns=at_ns)
-
-
-def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
-    """The controller reports it in words, too, but only the change itself has the tick."""
-    make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
-    more = [event(0.24, "controller", "changed", "gains set")]
-    happened = found(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
-    assert [mark.text for mark in happened if mark.kind == "changed"] == []
-    marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
-    assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
-    assert "C2 = [0.2, 0.2, 0.2]" in marks[1][1]
-    assert "0°, 5°, -10°" in marks[2][1]
-    assert "Gamma = [0.01, 0.01, 0.01]" in marks[3][1]
-    assert "sinusoid" in marks[3][1]
 
 
 HAPPENED = [

@@ -1,23 +1,30 @@
-"""Decoded channels for viewers: values in units for people, a bounded rate, and what is broken."""
+"""Decoded channels for viewers: values in units for people, a bounded rate, what is broken, schemas, and the layout."""
 
 from __future__ import annotations
 
 import json
+import re
 from itertools import pairwise
 from math import degrees, radians
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Loss, Truth
 from aeroloop.protocol.messages.operator import Message, Setpoint
 from aeroloop.protocol.messages.trace import ENDS, Sent
 from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.viewers.channels import Decoder
+from aeroloop.service.viewers.channels import SHAPES, Decoder
+from aeroloop.service.viewers.schemas import layout
 from tests.support.decoded import (
     ATTITUDE,
+    BODY,
     NOW,
     PITCH,
     RAW,
@@ -33,7 +40,7 @@ from tests.support.decoded import (
     configured,
     frame,
     measurement,
-    product,
+    quaternion_of,
     said,
     telemetry,
 )
@@ -85,13 +92,13 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
 @pytest.mark.parametrize("sign", [1, -1])
 def test_tracking_has_the_measured_attitude_where_the_error_puts_it(sign: int) -> None:
     error = about(2, radians(10.0))
-    wired: Quaternion = tuple(sign * part for part in error)  # type: ignore[assignment]  # z₁₋: the same turn, as −e
+    wired: Quaternion = tuple(sign * part for part in quaternion_of(error))  # type: ignore[assignment]  # z₁₋: −e
     found = by_topic(configured().take(address("telemetry"), telemetry(wired, sign).encode(), NOW))
     assert set(found) == {"/aero/tracking", "/aero/desired_pose", "/aero/desired_tf"}
     shown = said(found["/aero/tracking"])
     assert shown["error_deg"] == pytest.approx(10.0, abs=1e-4)
     assert shown["time_s"] == 0.5
-    for prefix, q in (("", product(ATTITUDE, error)), ("desired_", ATTITUDE)):
+    for prefix, q in (("", quaternion_of(BODY * error)), ("desired_", ATTITUDE)):
         for name, expected in zip(("roll", "pitch", "yaw"), to_euler(q), strict=True):
             assert shown[f"{prefix}{name}_deg"] == pytest.approx(degrees(expected), abs=1e-3)
     assert [shown["error_q_deg_s"], shown["error_r_deg_s"]] == [2.0, -3.0]
@@ -235,3 +242,89 @@ def test_any_bytes_at_any_time_give_something_or_are_counted_and_never_raise(
 ) -> None:
     decoder = configured()
     assert bool(decoder.take(address(name), payload, at_ns)) != bool(decoder.malformed)
+
+
+# ── schemas ──
+
+
+def readable(schema: dict[str, Any]) -> bool:
+    """Whether Lichtblick reads it: its parseJsonSchema.ts."""
+    match schema.get("type"):
+        case "object":
+            return all(readable(field) for field in schema["properties"].values())
+        case "array":
+            return schema["items"]["type"] != "array" and readable(schema["items"])
+        case kind:
+            return kind in ("boolean", "string", "number", "integer") and not {"oneOf", "anyOf", "$ref"} & set(schema)
+
+
+TYPES: dict[str, type | tuple[type, ...]] = {
+    "boolean": bool, "string": str, "number": (int, float), "integer": int, "array": list, "object": dict
+}  # fmt: skip
+
+
+def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:
+    decoder = configured()
+    assert set(RAW) == {
+        topic.name for topic in topics.TOPICS.values() if topic.decoded or topic.kind in ("frame", "trace")
+    }
+    given = [shown for name, payload in RAW.items() for shown in decoder.take(address(name), payload, NOW)]
+    given += decoder.take(address("status", "controller"), STATUS.encode(), NOW)
+    given += decoder.take(address("status", "recorder"), STATUS.encode(), NOW)
+    assert {shown.topic: shown.shape for shown in given} == {f"/aero/{name}": shape for name, shape in SHAPES.items()}
+    for shown in given:
+        if shown.shape.encoding == "jsonschema":
+            schema, message = json.loads(shown.shape.schema), said(shown)
+            assert set(message) == set(schema["properties"])
+            for name, value in message.items():
+                assert value is None or isinstance(value, TYPES[schema["properties"][name]["type"]]), name
+
+
+def test_every_schema_is_one_that_viewers_read() -> None:
+    for name, shape in SHAPES.items():
+        if shape.encoding == "jsonschema":
+            assert readable(json.loads(shape.schema)), name
+            continue
+        package, _, message = shape.name.partition(".")
+        files = [fields(file) for file in fields(shape.schema)[1]]  # a FileDescriptorSet
+        declared = {(file[2][0].decode(), fields(found)[1][0].decode()) for file in files for found in file.get(4, [])}
+        assert (package, message) in declared, name
+
+
+# ── layout ──
+
+
+def leaves(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+
+
+@pytest.mark.parametrize(("vehicle", "actuators", "motors"), [("aero", 2, {2, 3}), ("bench.2", 3, {1, 2, 3})])
+def test_every_path_is_a_field_of_a_topic_that_is_decoded_and_voltages_are_those_of_the_motors_there_are(
+    vehicle: str, actuators: int, motors: set[int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A topic with a dot in it stands in quotes."""
+    assert execute(["show", "layout", "--set", f"vehicle={vehicle}", "--set", f"wire.actuators={actuators}"]) == 0
+    panels = json.loads(capfd.readouterr().out)["configById"].values()
+    found = [path["value"] for panel in panels for path in panel.get("paths", [])]
+    for path in found:
+        parts = re.fullmatch(
+            r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
+        )
+        assert parts is not None, path
+        assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
+        assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
+    shown = {path.rpartition(".")[2] for path in found}
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "p99", "state"} <= shown
+    assert {field for field in shown if field.startswith("voltage")} == {f"voltage_{i}_v" for i in motors}
+
+
+def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws_and_every_panel_has_its_place() -> None:
+    made = json.loads(layout("aero", WireSpec().motors))
+    panels = made["configById"]
+    assert sorted(leaves(made["layout"])) == sorted(panels)
+    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
+    assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
+    assert SHAPES["scene"].name == "foxglove.SceneUpdate"
+    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
+    assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"

@@ -21,7 +21,7 @@ from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
 from aeroloop.service.viewers.schemas import Decoded
-from tests.support.decoded import NOW, RAW, STATUS, about, telemetry
+from tests.support.decoded import ATTITUDE, NOW, RAW, STATUS, telemetry
 from tests.support.viewer_double import PATIENCE_S, Viewer
 
 TOPICS = {f"/aero/{name}" for name in SHAPES}
@@ -77,7 +77,7 @@ def loop(settings: Settings) -> Iterator[Node]:
     def publish() -> None:
         measured.put(RAW["measurement"])
         commanded.put(RAW["command"])
-        controller.publish("telemetry", telemetry(about(1, 0.1)))
+        controller.publish("telemetry", telemetry(ATTITUDE))
         plant.publish("status", STATUS)
 
     plant.announce()
