@@ -99,7 +99,7 @@ def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_l
     assert execute(["log", "review", str(log), "--session", "2"]) == 0
     out = " ".join(capfd.readouterr().out.split())
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
-    assert "sessions 1 s1, 0.4 s 2 s2, 0.2 s, shown --session N shows another of 2" in out
+    assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
 
 
 # Runs
