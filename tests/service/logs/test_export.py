@@ -130,7 +130,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     ticks.attitude[:2] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0)
     ticks.rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
     ticks.voltages[:] = (top["voltage"], -top["voltage"]), (nan, nan), (0.99 * top["voltage"], 0.0)
-    columns = columns_of((VEHICLE, SESSION), ticks, np.zeros((3, 11)), settings)
+    columns = columns_of((VEHICLE, SESSION), ticks, np.zeros((3, 10)), settings)
     found = {column.name[10:]: list(column.values) for column in columns if column.name.startswith("saturated")}
     expected = {
         "attitude_x": [1, nan, 0], "attitude_y": [1, nan, 0], "attitude_z": [0, nan, 0],
@@ -175,7 +175,8 @@ def test_every_column_names_its_unit_and_the_file_its_configuration(
     export([log], "mat", tmp_path / "a.mat")
     schema = pyarrow.parquet.read_schema(tmp_path / "a.parquet")
     matlab = scipy.io.loadmat(tmp_path / "a.mat", simplify_cells=True)["aeroloop"]
-    endings = {"_rad_s": "rad/s", "_Nms_rad": "N·m·s/rad", "_deg": "deg", "_ns": "ns", "_s": "s", "_V": "V"}
+    endings = {"_rad_s": "rad/s", "_Nms_rad": "N·m·s/rad", "_deg": "deg", "_V": "V"}
+    endings |= {"_ns": "ns", "_us": "µs", "_s": "s"}
     for field in schema:
         unit, description = field.metadata[b"unit"].decode(), field.metadata[b"description"].decode()
         expected = next((unit for ending, unit in endings.items() if field.name.endswith(ending)), None)

@@ -196,7 +196,8 @@ def test_the_first_row_that_is_not_what_was_done_is_named_at_either_end(tmp_path
     (session,) = (one for one in both.sessions if one.session == SESSION)
     assert [one.differ for one in both.sessions] == [0, 1] == [one.session == SESSION for one in both.sessions]
     assert session.first_difference is not None
-    assert (session.first_difference.tick, session.first_difference.time_s) == (321, pytest.approx(0.642))
+    assert session.first_difference.tick == 321
+    assert session.first_difference.time_s == pytest.approx(0.642)
     (signal,) = both.details["controller"]
     volts = [signal.split()[i] for i in (1, 4)]
     steps = abs(float(volts[0]) - float(volts[1])) / (48 / 63)  # (2·y_max)/(2^R − 1)
@@ -292,13 +293,9 @@ def ends_of(message: Logged) -> tuple[str, int, int] | None:
 
 
 def without(messages: list[Logged], first: int, last: int, end: str | None = None) -> list[Logged]:
-    """The messages without the batches, of one end or both, that begin within these ticks; and without other topics."""
-    kept = []
-    for message in messages:
-        found = ends_of(message)
-        if found is None or not (first <= found[1] <= last and end in (None, found[0])):
-            kept.append(message)
-    return kept
+    """The messages without the batches, of one end or both, that begin within these ticks."""
+    spans = [(message, ends_of(message)) for message in messages]
+    return [one for one, span in spans if span is None or not (first <= span[1] <= last and end in (None, span[0]))]
 
 
 @pytest.fixture(scope="module", params=["periodic", "on_change"])
