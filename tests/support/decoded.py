@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from math import cos, radians, sin
+from math import radians
 from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
-    PROTOCOL_VERSION,
-    Description,
     Event,
     Loss,
     Percentiles,
@@ -28,6 +29,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.viewers.channels import Decoder
 from aeroloop.service.viewers.schemas import Decoded
+from tests.support.made_log import description
 
 NOW = 1_800_000_000_000_000_000
 SETTINGS = load()
@@ -35,51 +37,30 @@ WIRE = SETTINGS.wire
 ROLL, PITCH, YAW = 0.1, -0.5, 0.9
 
 
-def about(axis: int, by: float) -> Quaternion:
+def quaternion_of(turn: Rotation) -> Quaternion:
+    return tuple(turn.as_quat(scalar_first=True).tolist())
+
+
+def about(axis: int, by: float) -> Rotation:
     """A turn about a body axis 1, 2 or 3 [rad]."""
-    turned = [cos(by / 2), 0.0, 0.0, 0.0]
-    turned[axis] = sin(by / 2)
-    return tuple(turned)  # type: ignore[return-value]  # four elements
+    return Rotation.from_rotvec(by * np.eye(3)[axis - 1])
 
 
-def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """The quaternion product pq."""
-    a, (b, c, d) = p[0], p[1:]
-    w, (x, y, z) = q[0], q[1:]
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + w * b + c * z - d * y,
-        a * y + w * c + d * x - b * z,
-        a * z + w * d + b * y - c * x,
-    )
+BODY = about(3, YAW) * about(2, PITCH) * about(1, ROLL)
+ATTITUDE = quaternion_of(BODY)
 
 
-ATTITUDE = product(about(3, YAW), product(about(2, PITCH), about(1, ROLL)))
-
-
-def description(role: str = "plant", *overrides: str, vehicle: str = "aero") -> Description:
-    """A role's description, configured with these overrides."""
-    return Description(
-        protocol=PROTOCOL_VERSION,
-        role=role,
-        vehicle=vehicle,
-        host="h",
-        versions={},
-        config=load(None, overrides).description(),
-    )
-
-
-def address(name: str, role: str = "plant", vehicle: str = "aero") -> topics.Address:
+def address(name: str, role: str = "plant") -> topics.Address:
     """Where a message of this name was received."""
-    found = topics.read_key(topics.key(name, vehicle, session="s1", role=role))
+    found = topics.read_key(topics.key(name, "aero", session="s1", role=role))
     assert found is not None
     return found
 
 
-def configured(rate_hz: float | None = None, *overrides: str) -> Decoder:
+def configured(rate_hz: float | None = None) -> Decoder:
     """A decoder that knows the plant; at most so many messages of a topic a second."""
     decoder = Decoder(rate_hz)
-    decoder.configure(description("plant", *overrides))
+    decoder.configure(description(SETTINGS, "plant"))
     return decoder
 
 
@@ -127,38 +108,22 @@ def said(decoded: Decoded) -> dict[str, Any]:
 def telemetry(error: Quaternion, sign: int = 1) -> Telemetry:
     """Telemetry with this attitude error."""
     return Telemetry(
-        session="s1",
-        tick=250,
-        counter=3,
-        attitude_error=error[1:],
-        rate_error=(0.0, radians(2.0), radians(-3.0)),
-        desired=ATTITUDE,
-        state={"damping_estimate": (0.0, 0.007, 0.0095), "sign": (sign,)},
-        voltages=(1.0, 2.0),
-    )
+        session="s1", tick=250, counter=3, attitude_error=error[1:], rate_error=(0.0, radians(2.0), radians(-3.0)),
+        desired=ATTITUDE, state={"damping_estimate": (0.0, 0.007, 0.0095), "sign": (sign,)}, voltages=(1.0, 2.0),
+    )  # fmt: skip
 
 
+TIMES = Percentiles(count=5000, p50=310.0, p99=620.0, p999=900.0, max=1000.0)
 STATUS = Status(
-    role="plant",
-    state="driven",
-    uptime_s=12.0,
-    ticks=6000,
-    rate_hz=500.0,
-    skipped=2,
-    recent_latency_us=Percentiles(count=5000, p50=310.0, p99=620.0, p999=900.0, max=1000.0),
+    role="plant", state="driven", uptime_s=12.0, ticks=6000, rate_hz=500.0, skipped=2, recent_latency_us=TIMES,
     timing=Timing(
-        wake=None,
-        busy=None,
-        period=None,
-        recent_wake=Percentiles(count=5000, p50=50.0, p99=90.0, p999=100.0, max=110.0),
-        recent_busy=None,
-        recent_period=None,
+        wake=None, busy=None, period=None, recent_wake=TIMES, recent_busy=None, recent_period=None,
     ),
-)
+)  # fmt: skip
 RAW = {
     "measurement": measurement(0, 0, 0, 0, 0, 0),
     "command": frame(WIRE.command, [WIRE.voltage.quantizer()] * 2, [1.0, None]),
-    "telemetry": telemetry(about(1, 0.1)).encode(),
+    "telemetry": telemetry(quaternion_of(about(1, 0.1))).encode(),
     "truth": Truth(tick=1, attitude=ATTITUDE, rate=(0.0, 0.0, 0.0), voltages=(1.0, 2.0)).encode(),
     "reference": Setpoint(attitude=(0.0, 0.0, 0.0)).encode(),
     "status": STATUS.encode(),

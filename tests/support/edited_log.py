@@ -1,18 +1,21 @@
-"""Edited logs: a copy of a log with messages moved, replaced, dropped or added, or rows of batches edited.
+"""Edited logs: copies with messages replaced, dropped or added, rows of batches edited, or a part of the file damaged.
 
 Also builds ticks by hand.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
@@ -25,6 +28,9 @@ from tests.support.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
 LATENCY_NS = 2 * ONE_WAY_NS
+HEAD: Final = struct.Struct("<BQ")
+FOOTER: Final = struct.Struct("<QQI")
+END: Final = HEAD.size + FOOTER.size + len(MAGIC)
 
 
 class Said(NamedTuple):
@@ -72,15 +78,7 @@ def rewrite(
     more: Sequence[Said] = (),
     metadata: Iterable[tuple[str, dict[str, str]]] = (),
 ) -> Path:
-    """Write a log again.
-
-    Args:
-        log: The log.
-        out: The new one.
-        change: What becomes of each message; None leaves it out.
-        more: Messages to add, where they were recorded.
-        metadata: Metadata to add, by name.
-    """
+    """Write a log again, with each message changed (None leaves it out), and with more messages and metadata."""
     messages, known = contents(log)
     kept = [one for message in messages if (one := change(message)) is not None]
     return write_messages(out, sorted([*kept, *more], key=lambda one: one.at_ns), [*known, *metadata])
@@ -132,3 +130,57 @@ def at_rest(k: Sequence[int] | npt.NDArray[np.int64], **columns: Any) -> Ticks:
         volts, volts, np.full((n, 9), 0.3), state, state,
     )  # fmt: skip
     return ticks._replace(**columns)
+
+
+class Part(NamedTuple):
+    """A record as it stands in the file."""
+
+    offset: int
+    opcode: int
+    content: bytes
+
+    @property
+    def end(self) -> int:
+        return self.offset + HEAD.size + len(self.content)
+
+
+class Read(NamedTuple):
+    """A message as it stands in a file."""
+
+    topic: str
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+def parts(data: bytes, at: int = 0) -> list[Part]:
+    found = []
+    while at < len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        found.append(Part(at, opcode, data[at + HEAD.size : at + HEAD.size + length]))
+        at = found[-1].end
+    return found
+
+
+def chunks(data: bytes) -> list[Part]:
+    return [part for part in parts(data[: -len(MAGIC)], len(MAGIC)) if part.opcode == Opcode.CHUNK]
+
+
+def with_a_damaged_chunk(whole: Path, out: Path, which: int | None = None) -> Path:
+    """A copy with a bit flipped in the middle of a chunk, of the middle one if None."""
+    data = bytearray(whole.read_bytes())
+    places = chunks(bytes(data))
+    chunk = places[len(places) // 2 if which is None else which]
+    data[(chunk.offset + chunk.end) // 2] ^= 0x55
+    out.write_bytes(data)
+    return out
+
+
+def by_mcap(path: Path) -> list[Read]:
+    """Every message of a whole file, as mcap's own reader has them by the index."""
+    with path.open("rb") as file:
+        return [
+            Read(channel.topic, one.sequence, one.log_time, one.publish_time, one.data)
+            for _, channel, one in make_reader(file).iter_messages(log_time_order=False)
+        ]

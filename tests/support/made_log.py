@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.driver import Driver
@@ -20,7 +20,7 @@ from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
-from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, Received, Sent, TraceWriter
 from aeroloop.protocol.transport.history import Delivery as Message
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -230,45 +230,20 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Rough:
 
 
 def make_log(
-    path: Path,
-    ticks: int,
-    *,
-    settings: Settings | None = None,
-    begin: int = 0,
-    changes: Changes | None = None,
-    spoil: int | None = None,
-    chunk_every: int = 20,
-    truth_every: int = 0,
-    lost: Container[int] = (),
-    skipped: Container[int] = (),
-    injected: Mapping[int, str | None] = {},
+    path: Path, ticks: int, *, settings: Settings | None = None, begin: int = 0, chunk_every: int = 20, **options: Any
 ) -> None:
-    """Write a log of a loop in which nothing else goes wrong.
-
-    Args:
-        path: Where.
-        ticks: How many ticks the loop runs.
-        settings: Its configuration.
-        begin: Batches before this tick are not recorded.
-        changes: Gains and reference that an operator sets, by tick.
-        spoil: The tick whose command is not logged as it was sent.
-        chunk_every: Close a chunk after so many messages.
-        truth_every: Publish the true state every so many ticks; 0 is never.
-        lost: Ticks whose measurement never reaches the controller.
-        skipped: Ticks that the plant has no time for.
-        injected: Faults that are injected before a tick; None clears all. With faults, injected or configured, the
-            plant also publishes events, and a status every 100 ticks.
-    """
+    """Write a log of a loop, without the messages before a tick; `options` as of `made`."""
     settings = settings or lockstep()
-    messages = made(settings, ticks, changes or {}, spoil, truth_every, lost, skipped, injected=injected)
-    write(path, settings, [message for message in messages if not begin or not _before(message, begin)], chunk_every)
+    since_ns = START_NS + begin * settings.loop.period_ns
+    messages = [message for message in made(settings, ticks, **options) if message.at_ns >= since_ns]
+    write(path, settings, messages, chunk_every)
 
 
 def made(
     settings: Settings,
     ticks: int,
     changes: Changes = {},  # noqa: B006  # never changed
-    spoil: int | None = None,
+    *,
     truth_every: int = 0,
     lost: Container[int] = (),
     skipped: Container[int] = (),
@@ -277,10 +252,20 @@ def made(
     injected: Mapping[int, str | None] = {},
     rough: Rough | None = None,
 ) -> list[Logged]:
-    """The messages of such a loop; arguments as of `make_log`.
+    """The messages of a loop in which nothing else goes wrong; each session is of processes of its own.
 
-    The session may have another name, and begin so long after the first instant of both clocks [ns]; each session is
-    of processes of its own. What goes otherwise by chance in a `rough` loop is noted there.
+    Args:
+        settings: Its configuration.
+        ticks: How many ticks it runs.
+        changes: Gains and reference that an operator sets, by tick.
+        truth_every: Publish the true state every so many ticks; 0 is never.
+        lost: Ticks whose measurement never reaches the controller.
+        skipped: Ticks that the plant has no time for.
+        session: Its name.
+        at_ns: When it begins, after the first instant of both clocks [ns].
+        injected: Faults that are injected before a tick; None clears all. With faults, injected or configured, the
+            plant also publishes events, and a status every 100 ticks.
+        rough: Notes what goes otherwise by chance.
     """
     wire, loop = settings.wire, settings.loop
     messages = Messages()
@@ -357,8 +342,7 @@ def made(
             rough.commands[k] = command
             clock.now_ns += rough.takes(200_000)
         received_as = Received.FRAME if taken else Received.SILENT
-        logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
-        end.record(PlantTick(k, taken, received_as, received_ns, received_ns), logged, clock.monotonic_ns())
+        end.record(PlantTick(k, taken, received_as, received_ns, received_ns), command, clock.monotonic_ns())
         if k % 10 == 0 and end.controller.tick_index == k:
             messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
         if command or (command is not None and loop.lockstep):
@@ -375,15 +359,6 @@ def made(
     if injected or settings.plant.faults:
         publish(ticks)
     return messages.all
-
-
-def _before(message: Logged, begin: int) -> bool:
-    """Whether a message is a batch with rows of ticks before this one."""
-    batch = read_batch(message.payload) if "/trace/" in message.key else None
-    if batch is None:
-        return (message.at_ns - START_NS) // 2_000_000 < begin
-    ticks = batch.columns["tick" if batch.header.end == "controller" else "session_tick"]
-    return not len(ticks) or int(ticks[0]) < begin
 
 
 AN_OPERATORS_WORDS: Changes = {

@@ -95,20 +95,8 @@ def made_report(
         checks=list(checks),
         theorem=theorem,
     )
-    usual = {
-        "vehicle": "aero",
-        "loop": {"rate_hz": 500.0, "lockstep": False},
-        "wire": {
-            "attitude": {"bits": 8, "limit": 1.0},
-            "rate": {"bits": 8, "limit": 1.0},
-            "voltage": {"bits": 6, "limit": 24.0},
-        },
-        "law": {"C2": [0.15, 0.15, 0.15]},
-    }
-    facts: dict[str, dict[str, Any]] = {
-        "controller": {"host": "h", "versions": {"aeroloop": "0.1.0"}},
-        "plant": {"host": "h"},
-    }
+    usual = {"vehicle": "aero", "loop": {"rate_hz": 500.0, "lockstep": False}, "law": {"C2": [0.15, 0.15, 0.15]}}
+    facts: dict[str, dict[str, Any]] = {"controller": {"host": "h", "versions": {"aeroloop": "0.1.0"}}}
     return Report(name, findings, time, panels, thinned, usual | (settings or {}), facts)
 
 

@@ -9,11 +9,9 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -115,12 +113,6 @@ class Viewer:
         while not set(topics) <= set(self.channels):
             self._read()
 
-    def await_closed(self) -> None:
-        """Listen until the server has closed the connection."""
-        with suppress(ConnectionClosed):
-            while True:
-                self._read()
-
     def subscribe(self, *topics: str) -> None:
         """Ask for what has been advertised; ids of subscriptions are those of channels and 1000."""
         wanted = [
@@ -128,18 +120,11 @@ class Viewer:
         ]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
-    def receive(self) -> tuple[str, Shown]:
-        """The next message, and its topic."""
-        while (message := self._read()) is None:
-            pass
-        return message
-
     def first(self, topic: str) -> Shown:
         """The next message of a topic."""
         while True:
-            found, shown = self.receive()
-            if found == topic:
-                return shown
+            if (message := self._read()) is not None and message[0] == topic:
+                return message[1]
 
     def _read(self) -> tuple[str, Shown] | None:
         message = self._socket.recv(PATIENCE_S)

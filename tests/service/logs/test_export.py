@@ -1,4 +1,4 @@
-"""Export: the same ticks and numbers as the review in every format, and null for missing values."""
+"""Export: the same ticks and numbers as the review in every format, null for missing values, and decoded logs."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ import pyarrow.parquet
 import pytest
 import scipy.io
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
-from aeroloop.service.logs.export import columns_of, export
-from aeroloop.service.logs.outputs import OutputError
-from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.export import ExportError, columns_of, export
+from aeroloop.service.logs.recording import Recording
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import PERIOD_NS
-from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
+from aeroloop.service.viewers.channels import Decoder
+from tests.support.edited_log import PERIOD_NS, Said, at_rest, by_mcap, contents, rewrite
+from tests.support.made_log import SESSION, START_NS, VEHICLE, made, make_log, write
 
 TICKS = 400
 SKIPPED = range(100, 148)
@@ -83,22 +82,18 @@ def test_the_rows_sum_up_to_the_figures_of_the_review(log: Path, parquet: Table,
     assert max(parquet["error_angle_deg"]) == pytest.approx(figures.max_error_deg, rel=4e-14)
 
 
-def test_a_gap_stays_a_gap(parquet: Table) -> None:
+def test_a_gap_stays_a_gap_and_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: Settings) -> None:
+    """Every tenth tick has a truth, unless the plant skipped it."""
     ticks = [k for k in range(TICKS) if k not in SKIPPED]
     assert parquet["tick"] == ticks
     assert parquet["time_s"] == [k * 0.002 for k in ticks]
     assert parquet["published_ns"] == [START_NS + k * PERIOD_NS for k in ticks]
-
-
-def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: Settings) -> None:
-    """Every tenth tick has one, unless the plant skipped it."""
     quantizer = settings.wire.rate.quantizer()
     for row in rows(parquet):
         last = max(k for k in range(0, row["tick"] + 1, 10) if k not in SKIPPED)
         assert row["truth_age_s"] == pytest.approx((row["tick"] - last) * 0.002)
         if last == row["tick"]:  # the gyro's noise and its quantizer lie between
             assert row["rate_z_rad_s"] == pytest.approx(row["truth_rate_z_rad_s"], abs=quantizer.limit / 20)
-    assert len(set(parquet["truth_voltage_2_V"])) > 3
 
 
 def test_a_plants_own_signals_reach_the_log_the_table_and_the_page(tmp_path: Path) -> None:
@@ -129,33 +124,20 @@ def test_a_plants_own_signals_reach_the_log_the_table_and_the_page(tmp_path: Pat
 
 
 def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded() -> None:
-    wire = WireSpec(actuators=3)
-    top = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
-    zeros, one = np.zeros((3, 3)), np.ones(3)
-    attitude = np.zeros((3, 4))
-    attitude[:] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-    rate, volts = zeros.copy(), np.full((3, 3), nan)
-    rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
-    volts[0] = top["voltage"], -top["voltage"], 0.0
-    k = np.arange(3)
-    law = attitude, attitude, rate, zeros, zeros, volts, volts, np.zeros((3, 9)), attitude, attitude
-    ticks, truth = Ticks(k, k, k, one, one, one, *law), np.zeros((3, 11))
-    columns = columns_of((VEHICLE, SESSION), ticks, truth, load().model_copy(update={"wire": wire}))
-    found = {column.name: list(column.values) for column in columns if column.name.startswith("saturated")}
-    np.testing.assert_equal(
-        found,
-        {
-            "saturated_attitude_x": [1, nan, 0],
-            "saturated_attitude_y": [1, nan, 0],
-            "saturated_attitude_z": [0, nan, 0],
-            "saturated_rate_x": [1, 0, 0],
-            "saturated_rate_y": [1, 0, 0],
-            "saturated_rate_z": [0, 0, 0],
-            "saturated_voltage_1": [1, nan, nan],
-            "saturated_voltage_2": [1, nan, nan],
-            "saturated_voltage_3": [0, nan, nan],
-        },
-    )
+    settings = load()
+    top = {name: getattr(settings.wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
+    ticks = at_rest(range(3))
+    ticks.attitude[:2] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0)
+    ticks.rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
+    ticks.voltages[:] = (top["voltage"], -top["voltage"]), (nan, nan), (0.99 * top["voltage"], 0.0)
+    columns = columns_of((VEHICLE, SESSION), ticks, np.zeros((3, 10)), settings)
+    found = {column.name[10:]: list(column.values) for column in columns if column.name.startswith("saturated")}
+    expected = {
+        "attitude_x": [1, nan, 0], "attitude_y": [1, nan, 0], "attitude_z": [0, nan, 0],
+        "rate_x": [1, 0, 0], "rate_y": [1, 0, 0], "rate_z": [0, 0, 0],
+        "voltage_2": [1, nan, 0], "voltage_3": [1, nan, 0],
+    }  # fmt: skip
+    np.testing.assert_equal(found, expected)
 
 
 def test_every_kind_of_file_holds_the_same(log: Path, tmp_path: Path, parquet: Table) -> None:
@@ -193,80 +175,87 @@ def test_every_column_names_its_unit_and_the_file_its_configuration(
     export([log], "mat", tmp_path / "a.mat")
     schema = pyarrow.parquet.read_schema(tmp_path / "a.parquet")
     matlab = scipy.io.loadmat(tmp_path / "a.mat", simplify_cells=True)["aeroloop"]
-    endings = {
-        "_rad_s": "rad/s",
-        "_Nms_rad": "N·m·s/rad",
-        "_deg": "deg",
-        "_ns": "ns",
-        "_us": "µs",
-        "_s": "s",
-        "_V": "V",
-    }
+    endings = {"_rad_s": "rad/s", "_Nms_rad": "N·m·s/rad", "_deg": "deg", "_V": "V"}
+    endings |= {"_ns": "ns", "_us": "µs", "_s": "s"}
     for field in schema:
         unit, description = field.metadata[b"unit"].decode(), field.metadata[b"description"].decode()
         expected = next((unit for ending, unit in endings.items() if field.name.endswith(ending)), None)
         assert unit == expected if expected else unit in ("", "1"), field.name
-        assert len(description) > 5
         assert "".join(matlab["units"][field.name]) == unit  # of an empty text scipy makes an empty array
-        assert matlab["descriptions"][field.name] == description
+        assert len(description) > 5
     facts = {key.decode(): json.loads(value) for key, value in schema.metadata.items() if key.startswith(b"aeroloop.")}
     assert from_description(facts["aeroloop.config"]).description() == settings.description()
     assert json.loads(matlab["config"]) == facts["aeroloop.config"]
     assert facts["aeroloop.sessions"] == [f"{VEHICLE}/{SESSION}"]
-    assert facts["aeroloop.exported_by"]["aeroloop"]
 
 
-def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Path, tmp_path: Path) -> None:
-    def ticks(session: str | None) -> list[tuple[str, int]]:
-        out = tmp_path / f"{session}.parquet".replace("/", "-")
-        exported = export([log], "parquet", out, session=session)
-        table = pyarrow.parquet.read_table(out, columns=["session", "tick"]).to_pydict()
-        assert exported.rows == len(table["tick"])
-        everything = {f"{VEHICLE}/{SESSION}", f"{VEHICLE}/{SHORT}"}
-        assert set(exported.sessions or ()) | set(exported.left_out) == everything
-        assert len(exported.sessions or ()) + len(exported.left_out) == 2
-        return list(zip(table["session"], table["tick"], strict=True))
+@pytest.mark.parametrize(
+    ("session", "exported", "other"),
+    [("1", [SESSION], SHORT), ("2", [SHORT], SESSION), ("all", [SESSION, SHORT], None)],
+)
+def test_the_sessions_that_are_asked_for_are_exported_and_the_others_are_named(
+    log: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    session: str,
+    exported: list[str],
+    other: str | None,
+) -> None:
+    out, ticks = tmp_path / "a.csv", {SESSION: [k for k in range(TICKS) if k not in SKIPPED], SHORT: list(range(50))}
+    assert execute(["log", "export", str(log), "--format", "csv", "--out", str(out), "--session", session]) == 0
+    with out.open(newline="") as file:
+        found = [(row["session"], int(row["tick"])) for row in csv.DictReader(file)]
+    assert found == [(name, k) for name in exported for k in ticks[name]]
+    printed = capfd.readouterr().out
+    assert (f"not exported of this log: {VEHICLE}/{other};" in printed) == bool(other)
+    assert ("not exported" in printed) == bool(other)
 
-    first = [(SESSION, k) for k in range(TICKS) if k not in SKIPPED]
-    second = [(SHORT, k) for k in range(50)]
-    assert ticks(None) == first
-    assert ticks(SHORT) == ticks(f"{VEHICLE}/{SHORT}") == second
-    assert ticks("all") == first + second
-    assert ticks("2") == second
-    for session in ("none", "3", "0"):
-        with pytest.raises(ReviewError, match=f"of {VEHICLE} it holds 1 {SESSION}, 2 {SHORT}"):
-            ticks(session)
 
-
-def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behind(
+def test_an_export_that_fails_is_one_line_and_leaves_nothing_behind(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "text.mcap").write_text("hello")
-    before = sorted(tmp_path.iterdir())
-    for source, to, out, says in (
-        (log, "csv", tmp_path / "no" / "a.csv", "No such file"),
-        (log, "mcap", tmp_path / "no" / "a.mcap", "No such file"),
-        (tmp_path / "text.mcap", "mat", tmp_path / "a.mat", "text.mcap"),
-    ):
-        assert execute(["log", "export", str(source), "--format", to, "--out", str(out)]) == 1
-        (line,) = capfd.readouterr().err.splitlines()
-        assert says in line
-
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_batch", full)
-    with pytest.raises(OutputError, match="No space left"):
-        export([log], "parquet", tmp_path / "a.parquet")
-    assert sorted(tmp_path.iterdir()) == before
+    for to, out, says in (
+        ("parquet", "a", "No space left"),
+        ("csv", "no/a", "No such file"),
+        ("mcap", "no/a", "No such"),
+    ):
+        assert execute(["log", "export", str(log), "--format", to, "--out", str(tmp_path / out)]) == 1
+        (line,) = capfd.readouterr().err.splitlines()
+        assert says in line
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_names_the_sessions_that_it_leaves_out(
-    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    for session, left_out in (("1", SHORT), ("2", SESSION), ("all", None)):
-        out = str(tmp_path / f"{session}.csv")
-        assert execute(["log", "export", str(log), "--format", "csv", "--out", out, "--session", session]) == 0
-        printed = capfd.readouterr().out
-        assert (f"not exported of this log: {VEHICLE}/{left_out};" in printed) == bool(left_out)
-        assert ("not exported" in printed) == bool(left_out)
+# Decoded logs
+
+
+def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decoded(tmp_path: Path) -> None:
+    """Also where the recorder has decoded some already: those are made again, not doubled."""
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    make_log(log, TICKS, settings=load())
+    raw, descriptions = by_mcap(log), Recording([log]).descriptions
+    decoder = Decoder(rate_hz=10)
+    for description in descriptions.values():
+        decoder.configure(description)
+    decoded = [
+        Said(one.topic, one.at_ns, one.data)
+        for message in contents(log)[0]
+        if (address := topics.read_key(message.key)) is not None
+        for one in decoder.take(address, message.data, message.published_ns)
+    ]
+    assert decoded
+    exported = export([rewrite(log, tmp_path / "recorded.mcap", more=decoded)], "mcap", out)
+    found = by_mcap(out)
+    assert exported.rows == len(found)
+    assert sorted((m.topic, m.log_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
+        (m.topic, m.log_time, m.data) for m in raw
+    )
+    for name in ("measurement", "pose", "command"):
+        assert len([m for m in found if m.topic == f"/{VEHICLE}/{name}"]) == TICKS
+    assert Recording([out]).descriptions == descriptions
+    assert review(out).z_track == review(log).z_track
+    with pytest.raises(ExportError, match="--session"):
+        export([log], "mcap", tmp_path / "other.mcap", session=SESSION)

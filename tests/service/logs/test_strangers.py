@@ -20,7 +20,6 @@ from aeroloop.service.report.page import page
 from aeroloop.service.review.compare import read_runs
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
-from aeroloop.service.viewers.channels import Decoder
 from tests.support.edited_log import Said, contents, rewrite
 from tests.support.every_message import MESSAGES
 from tests.support.hostile import TOKENS
@@ -145,34 +144,16 @@ def test_every_table_has_the_rows_of_the_clean_log(clean: Path, dirty: Path, tmp
     assert Path(a.out).read_text() == Path(b.out).read_text()
     assert (b.rows, b.columns, b.sessions) == (a.rows, a.columns, a.sessions)
     assert named(b.damages) == {"description", "trace", "truth"}
-    for to in ("parquet", "mat"):
-        assert export([dirty], to, tmp_path / f"a.{to}").rows == a.rows
 
 
-def test_a_decoded_log_has_every_channel_of_the_clean_one(clean: Path, dirty: Path, tmp_path: Path) -> None:
+def test_what_is_recovered_or_decoded_reads_as_the_clean_log(clean: Path, dirty: Path, tmp_path: Path) -> None:
+    assert recover(dirty, tmp_path / "out.mcap").lost == []
+    assert without_names(read(tmp_path / "out.mcap").findings) == without_names(read(clean).findings)
+    assert replay([tmp_path / "out.mcap"]).plant == replay([clean]).plant
     a, b = (export([log], "mcap", tmp_path / f"{log.stem}-decoded.mcap") for log in (clean, dirty))
     assert set(a.columns) <= set(b.columns)
     assert any("malformed: " in line for line in b.damages)
     assert replay([tmp_path / "dirty-decoded.mcap"]).controller == replay([clean]).controller
-
-
-def test_what_is_recovered_reads_as_the_clean_log(clean: Path, dirty: Path, tmp_path: Path) -> None:
-    assert recover(dirty, tmp_path / "out.mcap").lost == []
-    assert without_names(read(tmp_path / "out.mcap").findings) == without_names(read(clean).findings)
-    assert replay([tmp_path / "out.mcap"]).plant == replay([clean]).plant
-
-
-@pytest.mark.parametrize("rate_hz", [None, 30.0])
-def test_a_viewer_of_a_running_loop_shows_what_is_well_formed(rate_hz: float | None) -> None:
-    decoder = Decoder(rate_hz)
-    for role in ("controller", "plant"):
-        decoder.configure(description(lockstep(), role))
-    for one in strangers():
-        address = topics.read_key(one.key)
-        assert address is not None
-        decoder.take(address, one.data, one.published_ns)
-        decoder.take(address, one.data, 2**64 - 1)
-    assert decoder.malformed > 1000
 
 
 def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alone(
@@ -197,12 +178,9 @@ FIELDS = {"sizes": (4, 4), "rows": (8, 4), "run": (16, 8), "first_row": (24, 8),
     "wrong",
     [
         {"rows": 2**32 - 1},
-        {"rows": 257},
         {"first_row": 2**63 + 1},
         {"monotonic_ns": 2**62},
-        {"first_row": 20},
         {"first_row": 20, "sizes": 0x0004_0006},
-        {"run": 99},
         {"run": 99, "first_row": 2**62 - 1},
     ],
 )
@@ -224,4 +202,3 @@ def test_batches_that_no_end_publishes_are_malformed_messages(
     assert named(found.damages) == {"trace"}
     assert replay([path]).plants == replay([clean]).plants
     assert replay([path]).sessions == replay([clean]).sessions
-    assert export([path], "csv", tmp_path / "a.csv").rows == export([clean], "csv", tmp_path / "b.csv").rows

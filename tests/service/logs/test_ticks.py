@@ -9,19 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.models import Telemetry
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
-from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
-from aeroloop.service.logs.ticks import Ticks, codes_in, recompute
+from aeroloop.service.logs.ticks import Ticks, recompute
 from aeroloop.service.review.review import review
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws
@@ -56,29 +53,6 @@ def bits(values: Any) -> list[int]:
     """Doubles as integers: NaN equals itself, and −0 is not 0."""
     found: list[int] = np.asarray(values, dtype=np.float64).ravel().view(np.int64).tolist()
     return found
-
-
-@given(
-    widths=st.lists(st.none() | st.integers(2, 16), min_size=1, max_size=7),
-    counter_bits=st.integers(4, 16),
-    seed=st.integers(0, 2**32 - 1),
-    n=st.integers(0, 40),
-)
-def test_many_frames_are_read_as_each(widths: list[int | None], counter_bits: int, seed: int, n: int) -> None:
-    kind, rng = FrameFormat(widths, counter_bits), np.random.default_rng(seed)
-    floats = [float("nan"), -0.0, 5e-324, -1.7e308, *rng.normal(size=10)]
-    rows = [
-        [
-            float(rng.choice(floats)) if width is None else int(rng.integers(-(2 ** (width - 1)), 2 ** (width - 1)))
-            for width in widths
-        ]
-        for _ in range(n)
-    ]
-    table = np.zeros(n, dtype=[("tick", "<u4"), ("frame", f"V{kind.size}")])
-    table["frame"] = np.array([kind.pack(i % kind.counters, row) for i, row in enumerate(rows)], f"V{kind.size}")
-    codes = codes_in(kind, table["frame"])
-    assert codes.shape == (n, len(widths))
-    assert bits(codes) == bits(rows)
 
 
 def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
@@ -178,19 +152,6 @@ def test_the_sign_of_q_goes_on_where_only_the_plant_has_a_tick(tmp_path: Path) -
     assert ticks.k.tolist() == list(range(400))
     assert np.abs(np.diff(ticks.attitude, axis=0)).max() < 0.2  # of η where ε has its outermost level, 0.996
     assert ticks.attitude[-1, 0] < -0.9
-
-
-def test_a_part_of_a_session_has_the_ticks_of_the_whole(tmp_path: Path) -> None:
-    make_log(tmp_path / "a.mcap", 1500, settings=load(), changes=AN_OPERATORS_WORDS, lost={700})
-    whole, part = (
-        recompute(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION), *times)).ticks
-        for times in ((), (1.0, 2.0))
-    )
-    assert part.k.tolist() == list(range(500, 1001))
-    for name in Ticks._fields:
-        if "delay" not in name:  # the clocks' offset is fitted by what is read
-            assert bits(getattr(part, name)) == bits(getattr(whole, name)[500:1001]), name
-    assert len(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION), 1.0, 2.0).controller) < 800
 
 
 def test_ticks_and_z_track_are_found_by_the_specification_alone() -> None:

@@ -119,9 +119,8 @@ def indexed(path: Path) -> tuple[int, int]:
     return topics.count(KEY), topics.count("/aero/x")
 
 
-STEPS = st.tuples(
-    st.sampled_from(["take", "wait", "full", "broken", "slow", "mend", "move", "remove"]), st.integers(1, 150)
-)
+WHAT = st.sampled_from(["take", "wait", "full", "broken", "slow", "no file", "mend", "move", "remove"])
+STEPS = st.tuples(WHAT, st.integers(1, 150))
 
 
 @settings(max_examples=60, deadline=None)
@@ -133,7 +132,6 @@ def test_whatever_happens_to_disk_and_files_every_message_is_recorded_and_every_
     with pytest.MonkeyPatch.context() as patch:
         disk = Disk()
         patch.setattr(os, "pwrite", disk.write)
-        patch.setattr(rolling, "CHUNK_S", 0.05)
         patch.setattr(rolling, "MAX_FILE_S", max_file_s)
         run = Run(folder / "a.mcap")
         for i, (step, n) in enumerate(steps):
@@ -149,14 +147,16 @@ def test_whatever_happens_to_disk_and_files_every_message_is_recorded_and_every_
                     disk.error = errno.EIO
                 case "slow":
                     disk.at_once = 100 * n
+                case "no file":
+                    disk.at_heads = errno.EACCES
                 case "mend":
-                    disk.room, disk.error = EVERYTHING, 0
+                    disk.room, disk.error, disk.at_heads = EVERYTHING, 0, 0
                 case "move" if run.log.path.exists():
                     run.log.path.rename(aside / f"{i}.moved")
                 case "remove" if run.log.path.exists():  # what is on the disk goes with it
                     shutil.copy(run.log.path, aside / f"{i}.removed")
                     run.log.path.unlink()
-        disk.room, disk.at_once, disk.error = EVERYTHING, EVERYTHING, 0
+        disk.room, disk.at_once, disk.error, disk.at_heads = EVERYTHING, EVERYTHING, 0, 0
         run.wait(rolling.RETRY_S)
         run.take(1)
         run.log.close(len(run.waiting))
@@ -171,62 +171,40 @@ def test_whatever_happens_to_disk_and_files_every_message_is_recorded_and_every_
             assert indexed(path) == (len(found), len(found))
 
 
-@pytest.mark.parametrize("room", range(HEAD, HEAD + 30_000, 2713))
-def test_on_a_disk_that_was_full_all_goes_on_in_one_whole_file(tmp_path: Path, disk: Disk, room: int) -> None:
-    """Wherever it was full: within a chunk's head, its data, the index. Nothing half stays behind meanwhile."""
-    run, path = Run(tmp_path / "a.mcap"), tmp_path / "a.mcap"
-    disk.room = room
-    run.take(120)
-    damages: list[str] = []
-    assert numbers(path, damages) == list(range(120 - len(run.waiting)))[: len(numbers(path))]
-    (damage,) = damages
-    assert damage.startswith("the file ends here, without its index (byte ")
-    disk.room = EVERYTHING
-    run.log.tend(at_once=True)  # as a recorder that is stopped does
-    run.wait(0.0)
-    run.log.close(len(run.waiting))
-    assert numbers(path) == list(range(120))
-    assert indexed(path) == (120, 120)
-    assert list(tmp_path.iterdir()) == [path]
-    if run.reported:
-        (refused, again), why = run.reported, os.strerror(errno.ENOSPC)
-        assert refused == (
-            f"{path} cannot be written: {why}; messages are kept in memory and written when it can be", True
-        )  # fmt: skip
-        assert again == (f"recording again to {path}", False)
-
-
 def test_a_fault_that_lasts_is_tried_every_second_and_reported_every_minute(tmp_path: Path, disk: Disk) -> None:
-    run = Run(tmp_path / "a.mcap")
+    run, path = Run(tmp_path / "a.mcap"), tmp_path / "a.mcap"
     disk.room, before = 0, disk.calls
     run.take(100)
+    refused = f"{path} cannot be written: {os.strerror(errno.ENOSPC)}"
+    assert run.log.trouble == refused
     for _ in range(600):
         run.wait(0.1)
     assert 55 <= disk.calls - before <= 62
-    assert len(run.faults()) == 1
+    assert run.faults() == [f"{refused}; messages are kept in memory and written when it can be"]
     for _ in range(10):
         run.wait(0.1)
     assert len(run.faults()) == 2
-    assert str(tmp_path / "a.mcap") in run.log.trouble
     disk.room = EVERYTHING
-    run.wait(1.0)
-    run.log.close()
+    run.log.tend(at_once=True)  # as a recorder that is stopped does
+    assert run.reported[-1] == (f"recording again to {path}", False)
+    run.wait(0.0)
+    run.log.close(len(run.waiting))
+    assert (numbers(path), indexed(path)) == (list(range(100)), (100, 100))
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_moved_file_and_a_missing_folder_are_reported_and_the_moved_file_is_whole(tmp_path: Path) -> None:
+def test_a_moved_file_and_a_missing_folder_are_reported(tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     run = Run(folder / "a.mcap")
     run.take(100)
     (folder / "a.mcap").rename(tmp_path / "moved")
     run.wait(1.0)
     assert run.faults() == [f"{folder / 'a.mcap'} was moved or removed while it was written"]
-    assert indexed(tmp_path / "moved") == (100, 100)
     shutil.rmtree(folder)
     run.take(100)
     assert run.log.trouble == f"{folder / 'a-0001.mcap'} cannot be written: {os.strerror(errno.ENOENT)}"
     folder.mkdir()
     run.wait(rolling.RETRY_S)
-    assert run.reported[-1] == (f"recording again to {folder / 'a-0002.mcap'}", False)
     run.log.close()
     assert numbers(folder / "a-0002.mcap")[-100:] == list(range(100, 200))
 
@@ -250,23 +228,6 @@ def test_a_file_that_is_removed_to_make_room_gives_its_room_back_and_one_that_is
     run.take(10)
     run.log.close()
     assert numbers(run.log.path)[-10:] == list(range(200, 210))
-
-
-def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rolling, "MAX_FILE_S", 2.0)
-    run = Run(tmp_path / "a.mcap")
-    disk.at_heads = errno.EACCES
-    run.take(3000)
-    why = os.strerror(errno.EACCES)
-    assert run.faults() == [f"no new file can be begun ({why}), so {tmp_path / 'a.mcap'} goes on"]
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]  # the half of another is removed
-    disk.at_heads = 0
-    run.take(100)
-    run.log.close()
-    first, second = parts(tmp_path / "a.mcap")
-    assert numbers(first) + numbers(second) == list(range(3100))
 
 
 def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_recovered(tmp_path: Path, disk: Disk) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64decode
 from dataclasses import replace
-from html.parser import HTMLParser
+from html import unescape
 from json import loads
 from math import inf
 from typing import Any
@@ -20,32 +21,10 @@ from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, made_th
 BROKEN = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
 
 
-class Texts(HTMLParser):
-    """The texts of a page, outside of scripts and styles."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-        self.element = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, _attrs: object) -> None:
-        self.element = tag
-
-    def handle_data(self, data: str) -> None:
-        if self.element not in {"script", "style"} and data.strip():
-            self.texts.append(" ".join(data.split()))
-
-
 def texts_of(*reports: Report) -> list[str]:
-    return Texts(page(reports)).texts
-
-
-def after(head: str, n: int, *reports: Report) -> list[str]:
-    """The texts of a row after its head."""
-    texts = texts_of(*reports)
-    at = texts.index(head)
-    return texts[at + 1 : at + 1 + n]
+    """The texts of a page, outside of scripts and styles."""
+    texts = re.split(r"<(?:script|style)\b.*?</(?:script|style)>|<[^>]+>", page(reports), flags=re.DOTALL)
+    return [" ".join(unescape(text).split()) for text in texts if text.strip()]
 
 
 def with_findings(report: Report, **changes: Any) -> Report:
@@ -66,22 +45,14 @@ def test_the_verdict_is_what_was_required_or_else_what_happened(report: Report, 
     assert words <= set(texts_of(report))
 
 
-def test_the_verdict_has_its_times() -> None:
-    error = Panel("error_angle", "Attitude error", "angle", "°", [Line("measured", np.linspace(4.84, 0, 501))])
-    run = made_report()
-    html = page([replace(run, panels=[*run.panels, error])])
-    verdict = html.partition('class="verdict bad"')[2].partition("</ul>")[0]
-    for found in ("Show 7.250 s: tripped", "Largest attitude error: 4.84°", "Show 0.000 s: largest attitude error"):
-        assert found in verdict
-
-
 def test_the_theorem_has_a_section_with_what_it_promises_and_only_inequalities_that_were_broken() -> None:
-    held, broken = (page([made_report(theorem=made_theorem(broken=n))]) for n in (0, 7))
-    assert 'data-name="theorem"' in held.partition('<section id="theorem"')[2].partition("</section>")[0]
-    verdict = "Holds: once there, ‖z‖ stays within 0.2004."
-    assert {verdict, "The run kept to Lemma 1 and the bound at every instant."} <= set(Texts(held).texts)
-    assert "(C.57)" not in Texts(held).texts
-    (judged,) = (text for text in Texts(held).texts if text.startswith("Judged"))
+    held, broken = (texts_of(made_report(theorem=made_theorem(broken=n))) for n in (0, 7))
+    assert {
+        "Holds: once there, ‖z‖ stays within 0.2004.",
+        "The run kept to Lemma 1 and the bound at every instant.",
+    } <= {*held}
+    assert "(C.57)" not in held
+    (judged,) = (text for text in held if text.startswith("Judged"))
     for part in (
         "until 8.5 s",
         "at 120 the sensors of the rate",
@@ -89,10 +60,8 @@ def test_the_theorem_has_a_section_with_what_it_promises_and_only_inequalities_t
         "52.0 %",
     ):
         assert part in judged
-    assert "Show 3.125 s: (C.57) ‖Φ − Φ^Q‖ first broken" in broken
-    assert {"7", "125.0", "The run broke Lemma 1."} <= set(Texts(broken).texts)
+    assert {"(C.57)", "7", "125.0", "The run broke Lemma 1."} <= set(broken)
     assert 'id="theorem"' not in page([made_report()])  # where no run was checked against it
-    assert verdict in texts_of(made_report("a"), made_report("b", theorem=made_theorem()))
 
 
 def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_and_which_part_is_drawn() -> None:
@@ -100,18 +69,18 @@ def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_an
     assert damage in texts_of(made_report(damages=[damage]))
     assert "What is missing from the log" not in texts_of(made_report())
     assert "up to 64 ticks, 0.128 s" in page([made_report(thinned=64)])
-    assert 'id="drawn"' not in page([made_report(thinned=2)])
     part = texts_of(replace(made_report(), part=(2.0, inf)))
     assert "Judged is the part from 2 s to 10 s alone; trips, events and what is missing are of the whole log." in part
 
 
 def test_a_comparison_has_differences_to_the_first_run() -> None:
     first = made_report("a")
-    both = first, replace(with_findings(first, z_track=0.00916, max_error_deg=2.42, trips=[]), name="b")
-    assert after("tracking error z_track", 3, *both) == ["45.80", "91.60", "+45.80 (+100.0 %)"]
-    assert after("largest attitude error", 3, *both) == ["4.84", "2.42", "−2.42 (−50.0 %)"]
-    assert after("final attitude error", 3, *both) == ["0.46", "0.46", "0"]
-    assert "Δ to a" in texts_of(*both)
+    texts = texts_of(first, replace(with_findings(first, z_track=0.00916, max_error_deg=2.42, trips=[]), name="b"))
+    at = texts.index("tracking error z_track")
+    assert texts[at + 1 : at + 4] == ["45.80", "91.60", "+45.80 (+100.0 %)"]
+    at = texts.index("final attitude error")
+    assert texts[at + 1 : at + 4] == ["0.46", "0.46", "0"]
+    assert "2 runs compared" in texts
 
 
 def test_every_tick_is_in_the_data_and_a_text_in_it_cannot_end_its_script() -> None:
@@ -124,13 +93,6 @@ def test_every_tick_is_in_the_data_and_a_text_in_it_cannot_end_its_script() -> N
         np.testing.assert_array_equal(np.frombuffer(b64decode(typed["bdata"]), typed["dtype"]), values)
 
 
-def test_durations_are_drawn_in_ms_on_a_logarithmic_axis_where_they_differ_widely() -> None:
-    drawn = {drawing.name: drawing.figure["layout"] for drawing in drawings([made_report()])}
-    assert (drawn["latency"]["yaxis"]["title"]["text"], drawn["latency"]["yaxis"]["type"]) == ("latency<br>[ms]", "log")
-    assert all(layout["xaxis"]["title"]["text"] == "time [s]" for layout in drawn.values())
-
-
-def test_a_run_without_values_has_a_page_and_one_log_may_be_compared_with_itself() -> None:
+def test_a_run_without_values_has_a_page() -> None:
     bare = replace(made_report(marks=()), time=np.empty(0), panels=[], settings={}, facts={})
     assert "Nothing to judge" in texts_of(with_findings(bare, timing={}, gaps=[], gap_count=0, z_track=None))
-    assert "2 runs compared" in texts_of(made_report(), made_report())

@@ -52,15 +52,14 @@ def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(fau
     ]  # fmt: skip
 
 
-def test_the_verdict_names_the_faults(faulty: Path) -> None:
+def test_the_verdict_names_the_faults_and_a_review_lists_them_before_the_figures(
+    faulty: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     findings = read(faulty).findings
     word, good, because = verdict(findings)
     assert (word, good) == ("Faults", None)
     counts = f"{findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
     assert f"3 faults acted at the plant: {counts}." in because
-
-
-def test_review_lists_them_before_the_figures(faulty: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert execute(["log", "review", str(faulty)]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert text.index("command:drop=0.3@0.2..0.6 0.200 s 0.600 s") < text.index(" z_track ")

@@ -1,4 +1,4 @@
-"""Findings of a log: events in order on the session's clock, limits, JSON and terminal table."""
+"""Findings of a log against its content: events, gaps, timing and invalid frames; limits, JSON, terminal table."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aeroloop.protocol.messages.models import Event, Loss
+from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status
 from aeroloop.protocol.messages.trace import Outcome, Received, read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.review.observations import gaps
 from aeroloop.service.review.report import Check, Findings
 from aeroloop.service.review.requirements import Limit, LimitError
-from aeroloop.service.review.review import read
+from aeroloop.service.review.review import LOCKSTEP, read
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import Said, edited, message_of, rewrite
-from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, make_log
+from tests.support.made_log import AHEAD_NS, SESSION, START_NS, make_log
 
 
 def found(path: Path) -> Findings:
@@ -38,20 +39,6 @@ def event(at_s: float, role: str, kind: str, text: str, session: str | None = "s
     return message_of("event", message, published_ns)._replace(recorded_ns=at_ns)
 
 
-def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
-    """The controller reports it in words, too, but only the change itself has the tick."""
-    make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
-    more = [event(0.24, "controller", "changed", "gains set")]
-    happened = found(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
-    assert [mark.text for mark in happened if mark.kind == "changed"] == []
-    marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
-    assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
-    assert "C2 = [0.2, 0.2, 0.2]" in marks[1][1]
-    assert "0°, 5°, -10°" in marks[2][1]
-    assert "Gamma = [0.01, 0.01, 0.01]" in marks[3][1]
-    assert "sinusoid" in marks[3][1]
-
-
 HAPPENED = [
     event(-7.0, "plant", "started", "waits", session=None),
     event(-0.2, "controller", "started", "looks for it", session=None),
@@ -60,7 +47,8 @@ HAPPENED = [
     event(0.52, "controller", "fault", "16 ticks missed", session=None),
     event(0.59, "controller", "fault", "5 ticks missed", tick=255),
     event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event/controller"),
-    event(1.1, "plant", "tripped", "tilted", tick=499),
+    *[event(1.1, "plant", "tripped", "tilted", tick=499)] * 2,  # recorded twice
+    event(1.12, "plant", "tripped", "never")._replace(key="aeroloop/aero/event/recorder"),  # forged
     event(1.3, "plant", "released", "at its end"),
     event(60.0, "plant", "stopped", "at 0 V", session=None),
 ]
@@ -72,12 +60,13 @@ SHOWN = [
     (0.51, "controller", "fault", "5 ticks missed"),
     (0.52, "controller", "fault", "16 ticks missed"),
     (0.998, "plant", "tripped", "tilted"),
+    (0.998, "recorder", "tripped", "never"),
     (0.998, "plant", "released", "at its end"),
     (None, "plant", "stopped", "at 0 V"),
 ]
 
 
-def test_events_are_shown_at_their_sender_s_time_wherever_they_stand_in_the_file(whole: Path, tmp_path: Path) -> None:
+def test_events_are_shown_once_at_their_sender_s_time_as_of_the_role_in_their_key(whole: Path, tmp_path: Path) -> None:
     """The clocks of both ends differ by 10 s; a recorder writes late what it recovers from a cache."""
     chance = random.Random(1)
     said = [one._replace(recorded_ns=START_NS + round(chance.uniform(-10, 70) * 1e9)) for one in HAPPENED]
@@ -85,18 +74,6 @@ def test_events_are_shown_at_their_sender_s_time_wherever_they_stand_in_the_file
     marks = [mark for mark in findings.marks if mark.kind != "change"]
     assert [(mark.time_s and round(mark.time_s, 3), mark.role, mark.kind, mark.text) for mark in marks] == SHOWN
     assert findings.trips == ["tilted"]
-
-
-def test_a_trip_is_the_plants_by_the_key_of_its_event_and_counts_once_however_often_recorded(
-    whole: Path, tmp_path: Path
-) -> None:
-    trip, forged = (Event(role="plant", kind="tripped", text=text) for text in ("tilted", "never"))
-    once = message_of("event", trip, START_NS + 5 * 10**8)
-    more = [once, once, message_of("event", forged, START_NS + 5 * 10**8, "recorder")]
-    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
-    assert findings.trips == ["tilted"]
-    marks = [(mark.role, mark.text) for mark in findings.marks if mark.kind == "tripped"]
-    assert marks == [("plant", "tilted"), ("recorder", "never")]
 
 
 def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:
@@ -158,6 +135,84 @@ def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tm
     assert marks[-1].text == "600 more, the last: no 899"
 
 
+# Gaps
+
+
+def test_ticks_that_no_command_answered_are_gaps_whether_they_were_measured_or_not(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", TICKS, settings=load(), lost=range(50, 53), skipped=range(200, 240))
+    findings = found(tmp_path / "a.mcap")
+    assert [(gap.tick, gap.ticks, gap.time_s) for gap in findings.gaps] == [(50, 3, 0.1), (200, 40, 0.4)]
+    assert (findings.gap_count, findings.skipped_ticks, findings.lapses) == (2, 43, {"missed": 3})
+
+
+def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None:
+    lengths = [1 + i * 7919 % 1000 for i in range(3000)]
+    count, longest = gaps(np.cumsum([0, *(1 + length for length in lengths)]), 0.002)
+    assert count == 3000
+    assert sorted(gap.ticks for gap in longest) == sorted(lengths)[-100:]
+    assert [gap.tick for gap in longest] == sorted(gap.tick for gap in longest)
+
+
+# Timing
+
+
+def test_latency_and_period_are_those_of_the_plants_own_clock(whole: Path, tmp_path: Path) -> None:
+    """Ten late answers of 500, and one measurement 200 µs late; the plant's own status counts other sessions, too."""
+
+    def later(columns: Any) -> None:
+        columns["received"][columns["answered"] % 50 == 7] += 1000
+        columns["sent"][columns["session_tick"] == 300] += 200
+
+    slow = Percentiles(count=90_000, p50=1919, p99=9000, p999=9000, max=9000)
+    status = Status(
+        role="plant", state="driven", session=SESSION, uptime_s=1, ticks=1, rate_hz=1, skipped=0, latency_us=slow
+    )
+    more = [message_of("status", status, START_NS + 100_000_000, role="plant")]
+    findings = found(rewrite(whole, tmp_path / "a.mcap", edited("plant", later), more))
+    latency, period = findings.timing["latency"], findings.timing["period"]
+    assert (latency.count, period.count) == (TICKS - 1, TICKS - 1)  # nothing acts on the last command any more
+    assert (latency.p50, latency.p90, latency.p99, latency.max) == (300, 300, 1300, 1300)
+    assert (period.p50, period.p99, period.max) == (2000, 2000, 2200)
+    assert findings.latency_us == Percentiles(count=TICKS - 1, p50=300, p99=1300, p999=latency.p999, max=1300)
+    slow_bins = [count for edge, count in latency.bins if edge > 1000]
+    assert (sum(slow_bins), sum(count for _, count in latency.bins)) == (10, TICKS - 1)
+
+
+def test_in_lockstep_there_is_no_latency_and_no_age_and_the_reason_is_stated(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100, settings=load(overrides=["loop.lockstep=true"]))
+    findings = found(tmp_path / "a.mcap")
+    assert (findings.latency_us, findings.timing, findings.age_us) == (None, {}, None)
+    for name in ("latency_us", "age_us", "timing.latency", "timing.period", "clock_offset_us"):
+        assert findings.reasons[name] == LOCKSTEP
+    assert not {"latency", "period"} & {panel.group for panel in read(tmp_path / "a.mcap").report().panels}
+
+
+def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: Path, tmp_path: Path) -> None:
+    def status(i: int, p50: float, p99: float, most: float, session: str | None = "s1") -> Said:
+        age = Percentiles(count=9, p50=p50, p99=p99, p999=p99, max=most)
+        message = Status(
+            role="controller", state="running", session=session, uptime_s=1, ticks=1, rate_hz=1, skipped=0, age_us=age
+        )
+        return message_of("status", message, START_NS + i * 100_000_000)
+
+    more = [status(1, 400, 900, 1000), status(2, 400, 700, 5000), status(3, 500, 800, 900), status(4, 1, 9999, 1, "s2")]
+    assert found(rewrite(whole, tmp_path / "a.mcap", more=more)).age_us == {"p50": 400, "p99": 900, "max": 5000}
+    assert found(whole).age_us is None
+    assert "controller" in found(whole).reasons["age_us"]
+
+
+# Saturation, and what is no value
+
+
+def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Path) -> None:
+    """The gyro fails for seven ticks; the controller answers with commands without a valid value."""
+    faults = 'plant.faults=["rate.x:off@0.86..0.874"]'
+    make_log(tmp_path / "a.mcap", TICKS, settings=load(overrides=[faults]))
+    findings = found(tmp_path / "a.mcap")
+    assert findings.invalid == {"measurement": 7, "command": 7}
+    assert (findings.gap_count, findings.skipped_ticks) == (0, 0)
+
+
 # The whole
 
 
@@ -177,20 +232,14 @@ def test_what_is_no_limit_is_refused_in_one_line(text: str) -> None:
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
+def test_the_account_lists_trips_before_figures_and_what_does_not_hold(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
-    more = [event(0.5, "plant", kind, f"no {i} {kind}") for i in range(15) for kind in ("refused", "armed")]
-    path = rewrite(
-        tmp_path / "whole.mcap", tmp_path / "a.mcap", more=[*more, event(0.41, "plant", "tripped", "the [red] limit")]
-    )
+    more = [event(0.41, "plant", "tripped", "the [red] limit")]
+    path = rewrite(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
     assert execute(["log", "review", str(path), "--require", "gap_count=0"]) == 1
     out = " ".join(capsys.readouterr().out.split())
+    assert out.index("0.410 s plant tripped the [red] limit") < out.index(" z_track ")
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
-    assert "latency 300 µs 300 µs 300 µs 300 µs 300 µs" in out
-    assert out.startswith(
-        "time role event what 0.410 s plant tripped the [red] limit 0.500 s plant refused no 0 refused"
-    )
-    assert out.index("no 0 refused") < out.index(" z_track ") < out.index("no 0 armed")
     assert "✗ gap_count ≤ 0 1" in out

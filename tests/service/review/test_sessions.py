@@ -1,8 +1,9 @@
-"""Which session and vehicle a review judges, whose settings it shows, and that it never mixes unrelated runs."""
+"""Which session and vehicle a review judges, whose settings it shows, which runs it refuses to mix; comparisons."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from json import loads
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
+from aeroloop.service.review.compare import Comparison, read_runs
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import message_of, rewrite
-from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, write
+from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, make_log, write
 
 HOUR_NS = 3_600_000_000_000
 OTHER = "beta"
@@ -87,19 +89,15 @@ def test_a_session_is_judged_by_the_configuration_that_it_began_with(log: Path, 
     assert [(one.session, one.differ) for one in replayed.sessions] == [("s1", 0), ("b1", 0), ("s2", 0)]
 
 
-def test_trips_are_of_the_vehicle_and_of_a_named_session_alone(log: Path) -> None:
+def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_lists_all_of_both(
+    log: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert read(log).findings.trips == ["trip of s1", "trip of s2"]
     assert read(log, session="2").findings.trips == ["trip of s2"]
     assert read(log, vehicle=OTHER).findings.trips == ["trip of s1"]
     assert [mark.time_s for mark in read(log, session="2").findings.marks if mark.kind == "tripped"] == [None, 0.1]
-
-
-def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
-    log: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
     assert execute(["log", "review", str(log), "--session", "2"]) == 0
     out = " ".join(capfd.readouterr().out.split())
-    assert out.index("duration") < out.index("before plant tripped trip of s1")
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
     assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
 
@@ -162,3 +160,51 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     assert execute(["log", "review", str(path)]) == 0
     out = " ".join(capfd.readouterr().out.split())
     assert f"ends disagree plant.aero.mass: controller {controller.plant.aero.mass}, plant 2.0" in out
+
+
+# Comparisons
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Two runs that differ in a gain, and in where their logs are."""
+    folder = tmp_path_factory.mktemp("logs")
+    for name, gain in (("calm", "0.15"), ("keen", "0.3")):
+        mine = [f"recorder.path={name}", f"network.rendezvous=tcp/127.0.0.1:{len(name)}"]
+        settings = load(overrides=["loop.lockstep=true", f"law.C2=[{gain}, {gain}, {gain}]", *mine])
+        make_log(folder / f"{name}.mcap", 100, settings=settings)
+    return str(folder / "calm.mcap"), str(folder / "keen.mcap")
+
+
+def test_logs_are_compared_in_the_terminal_as_json_and_on_a_page(
+    logs: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    assert execute(("log", "compare", *logs, "--html", str(out))) == 0
+    printed = capfd.readouterr().out
+    assert "law.C2" in printed
+    assert "[0.3, 0.3, 0.3]" in printed
+    assert "2 runs compared" in out.read_text()
+    assert list(tmp_path.iterdir()) == [out]
+    assert execute(("log", "compare", *logs, "--json")) == 0
+    compared = loads(capfd.readouterr().out)
+    values = {"calm": [0.15] * 3, "keen": [0.3] * 3}
+    assert compared["differences"] == [{"key": "law.C2", "values": values}]
+    assert compared["runs"]["calm"]["z_track"] != compared["runs"]["keen"]["z_track"]
+
+
+def test_a_limit_holds_only_if_it_holds_for_every_run(logs: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert execute(("log", "compare", *logs, "--require", "duration_s=0.2")) == 0
+    assert execute(("log", "compare", *logs, "--require", "duration_s=0.1")) == 1
+    assert capfd.readouterr().err.splitlines()[-1].count("duration_s ≤ 0.1") == 2
+    assert execute(("log", "compare", logs[0])) == 2
+    assert capfd.readouterr().err == "aeroloop: log compare takes two logs or more\n"
+
+
+def test_logs_of_one_name_are_named_with_their_folders_or_by_number(logs: tuple[str, str], tmp_path: Path) -> None:
+    for folder, log in zip(("before", "after"), logs, strict=True):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "log.mcap").write_bytes(Path(log).read_bytes())
+    named = read_runs([tmp_path / "before/log.mcap", tmp_path / "after/log.mcap", tmp_path / "after/log.mcap"])
+    assert [run.name for run in named] == ["before/log", "after/log", "after/log (2)"]
+    assert list(Comparison.of(named).runs) == [run.name for run in named]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Truth
+from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Sinusoid, Stream
 from aeroloop.service.config import Settings, load
 from aeroloop.service.review import theorem as check
-from aeroloop.service.review.events import Truths
+from aeroloop.service.review.panels import NO_TRUTHS
 from aeroloop.service.review.report import Check, Findings, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
@@ -24,7 +24,7 @@ from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
 from tests.support.ideal import IDEAL
-from tests.support.made_log import SESSION, START_NS, make_log
+from tests.support.made_log import SESSION, START_NS, description, make_log
 
 TICKS = 4000
 CERTIFIED = (
@@ -80,7 +80,7 @@ def test_on_the_papers_plant_every_inequality_holds_at_every_tick(ideal: Path) -
     assert 0 < saturated < 50
     assert theorem.outside == {"C.28": 0, "C.29": 0, "C.30": saturated, "Assumption 3": 0}
     equations = [f"C.{n}" for n in (26, 27, *range(50, 58))]
-    assert [(one.equation, one.samples) for one in theorem.lemma] == [(number, theorem.judged) for number in equations]
+    assert {one.equation: one.samples for one in theorem.lemma} == dict.fromkeys(equations, theorem.judged)
     assert all(0 < one.closest <= 1 for one in theorem.lemma)
 
 
@@ -102,23 +102,21 @@ def test_a_bound_that_is_half_of_what_it_must_be_is_found_broken(ideal: Path, mo
     assert theorem.held is False
 
 
-def truth_with(one: Said, later: int = 0, **changed: Any) -> Said:
-    """A truth with these fields changed, of so many ticks later; any other message unchanged."""
-    if one.topic != "truth":
-        return one
-    truth = Truth.model_validate_json(one.data)
-    assert truth.session_tick is not None
-    fields = {"session_tick": truth.session_tick + later, **changed}
-    return one._replace(data=truth.model_copy(update=fields).encode())
-
-
 def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_path: Path) -> None:
     """Where nothing is quantized the two are equal, and those of neighbouring ticks are not."""
     cont = [f"wire.{name}.bits=cont" for name in ("attitude", "rate", "voltage")]
     make_log(tmp_path / "a.mcap", 300, settings=lockstep(*IDEAL, *cont), truth_every=1)
     _, exact = judged(tmp_path / "a.mcap")
     assert (exact.outside["C.28"], exact.outside["C.29"]) == (0, 0)
-    _, late = judged(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", lambda one: truth_with(one, later=1)))
+
+    def later(one: Said) -> Said:
+        if one.topic != "truth":
+            return one
+        truth = Truth.model_validate_json(one.data)
+        assert truth.session_tick is not None
+        return one._replace(data=truth.model_copy(update={"session_tick": truth.session_tick + 1}).encode())
+
+    _, late = judged(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", later))
     assert late.outside["C.29"] > 250
 
 
@@ -199,16 +197,6 @@ def test_a_session_is_judged_from_the_end_of_its_approach_until_the_next_change(
 # What is promised
 
 
-def truths_at(*ticks: int) -> Truths:
-    """True states at rest."""
-    k = np.array(ticks, dtype=np.int64)
-    return Truths(k, np.tile([1.0, 0.0, 0.0, 0.0], (len(k), 1)), np.zeros((len(k), 3)))
-
-
-def trial(truths: Truths, change: Change) -> TheoremCheck:
-    return check_theorem(load(overrides=["reference.kind=hold"]), at_rest([0]), truths, [change])
-
-
 def held(settings: Settings, **values: float) -> dict[str, Any]:
     """A certificate that holds, as the controller's description carries it."""
     return {**certify(settings).model_dump(mode="json"), "violated": [], "holds": True, "plant_deg": 40.0, **values}
@@ -219,23 +207,22 @@ def test_the_descriptions_certificate_is_what_counts_unless_the_session_began_wi
 ) -> None:
     settings = lockstep(*IDEAL)
     half = held(settings, plant_radius=0.5)
-    description = Description(
-        protocol=PROTOCOL_VERSION, role="controller", vehicle="aero", host="h", versions={},
-        config=settings.description(), certificate=half,
-    )  # fmt: skip
-    more = [message_of("description", description, START_NS - 10**9)]
+    its = description(settings, "controller").model_copy(update={"certificate": half})
+    more = [message_of("description", its, START_NS - 10**9)]
     assert judged(rewrite(ideal, tmp_path / "a.mcap", more=more))[1].pointwise_radius == 0.5
     other = change(0, gains=Gains(C1=(0.4, 0.3, 0.3)), reference=settings.reference)
     for changes, holds in (([], True), ([other], False)):
-        assert check_theorem(settings, at_rest([0]), truths_at(), changes, half).findings.holds is holds
+        assert check_theorem(settings, at_rest([0]), NO_TRUTHS, changes, half).findings.holds is holds
 
 
 def test_of_a_stream_and_of_gains_that_fail_nothing_is_guaranteed() -> None:
-    stream = trial(truths_at(), change(0, reference=Stream()))
+    def trial(change: Change) -> TheoremCheck:
+        return check_theorem(load(overrides=["reference.kind=hold"]), at_rest([0]), NO_TRUTHS, [change])
+
+    stream = trial(change(0, reference=Stream()))
     nothing = stream.findings
     assert (nothing.holds, nothing.held, nothing.pointwise_radius) == (None, None, None)
     assert all("stream" in stream.reasons[f"theorem.{name}"] for name in ("pointwise_radius", "broken", "held"))
-    failing = change(0, gains=Gains(C1=(3.0, 3.0, 3.0)), reference=load().reference)
-    failed = trial(truths_at(0), failing)
+    failed = trial(change(0, gains=Gains(C1=(3.0, 3.0, 3.0)), reference=load().reference))
     assert (failed.findings.holds, failed.findings.pointwise_deg) == (False, None)
     assert failed.reasons["theorem.pointwise_share"] == "the certificate does not hold"

@@ -1,28 +1,35 @@
-"""Decoded channels for viewers: values in units for people, a bounded rate, and what is broken."""
+"""Decoded channels for viewers: values in units for people, a bounded rate, what is broken, schemas, and the layout."""
 
 from __future__ import annotations
 
 import json
+import re
 from itertools import pairwise
 from math import degrees, radians
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Loss, Truth
 from aeroloop.protocol.messages.operator import Message, Setpoint
 from aeroloop.protocol.messages.trace import ENDS, Sent
 from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.viewers import schemas
-from aeroloop.service.viewers.channels import Decoder
+from aeroloop.service.viewers.channels import SHAPES, Decoder
+from aeroloop.service.viewers.schemas import layout
 from tests.support.decoded import (
     ATTITUDE,
+    BODY,
     NOW,
     PITCH,
     RAW,
     ROLL,
+    SETTINGS,
     STATUS,
     WIRE,
     YAW,
@@ -31,13 +38,13 @@ from tests.support.decoded import (
     batch,
     by_topic,
     configured,
-    description,
     frame,
     measurement,
-    product,
+    quaternion_of,
     said,
     telemetry,
 )
+from tests.support.made_log import description
 from tests.support.viewer_double import fields, orientation, quaternion
 
 VOLTS = WIRE.voltage.quantizer()
@@ -73,29 +80,25 @@ def test_what_a_measurement_does_not_know_is_null_and_gives_no_pose() -> None:
     assert decoder.malformed == 0
 
 
-@pytest.mark.parametrize(("sent", "shown", "saturated"), [(24.0, VOLTS.outermost, True), (None, None, None)])
-def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_or_null(
-    sent: float | None, shown: float | None, saturated: bool | None
-) -> None:
-    (command,) = configured().take(address("command"), frame(WIRE.command, [VOLTS, VOLTS], [sent, -3.0]), NOW)
-    assert said(command) == dict.fromkeys(schemas.Voltages.model_fields) | {
-        "voltage_2_v": shown if shown is None else pytest.approx(shown, abs=1e-4),
-        "voltage_3_v": pytest.approx(VOLTS.quantize(-3.0), abs=1e-4),
-        "saturated_2": saturated,
-        "saturated_3": False,
-    }
+def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_or_null() -> None:
+    for sent, shown, saturated in ((24.0, VOLTS.outermost, True), (None, None, None)):
+        (command,) = configured().take(address("command"), frame(WIRE.command, [VOLTS, VOLTS], [sent, -3.0]), NOW)
+        values = said(command)
+        expected = [shown, VOLTS.quantize(-3.0)]
+        assert [values["voltage_2_v"], values["voltage_3_v"]] == [v and pytest.approx(v, abs=1e-4) for v in expected]
+        assert (values["saturated_2"], values["saturated_3"], values["voltage_1_v"]) == (saturated, False, None)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_tracking_has_the_measured_attitude_where_the_error_puts_it(sign: int) -> None:
     error = about(2, radians(10.0))
-    wired: Quaternion = tuple(sign * part for part in error)  # type: ignore[assignment]  # z₁₋: the same turn, as −e
+    wired: Quaternion = tuple(sign * part for part in quaternion_of(error))  # type: ignore[assignment]  # z₁₋: −e
     found = by_topic(configured().take(address("telemetry"), telemetry(wired, sign).encode(), NOW))
     assert set(found) == {"/aero/tracking", "/aero/desired_pose", "/aero/desired_tf"}
     shown = said(found["/aero/tracking"])
     assert shown["error_deg"] == pytest.approx(10.0, abs=1e-4)
     assert shown["time_s"] == 0.5
-    for prefix, q in (("", product(ATTITUDE, error)), ("desired_", ATTITUDE)):
+    for prefix, q in (("", quaternion_of(BODY * error)), ("desired_", ATTITUDE)):
         for name, expected in zip(("roll", "pitch", "yaw"), to_euler(q), strict=True):
             assert shown[f"{prefix}{name}_deg"] == pytest.approx(degrees(expected), abs=1e-3)
     assert [shown["error_q_deg_s"], shown["error_r_deg_s"]] == [2.0, -3.0]
@@ -115,33 +118,26 @@ def test_truth_and_set_points_are_shown_as_they_were_published() -> None:
 
 
 @pytest.mark.parametrize(("kind", "rotors", "stands"), [("aero", 2, 1), ("rigid_body", 0, 0)])
-def test_a_status_shows_state_and_recent_times_and_a_plants_brings_the_body_in_the_frame_that_moves_it(
+def test_a_status_is_shown_as_it_is_and_a_plants_brings_the_body_in_the_frame_that_moves_it(
     kind: str, rotors: int, stands: int
 ) -> None:
-    described = description()
+    described = description(SETTINGS, "plant")
     described.config["plant"]["kind"] = kind
     decoder = Decoder(None)
     decoder.configure(described)
     found = by_topic(decoder.take(address("status"), STATUS.encode(), NOW))
     assert set(found) == {"/aero/status/plant", "/aero/scene"}
-    shown = said(found["/aero/status/plant"])
-    assert shown == json.loads(STATUS.encode())
-    (controllers,) = decoder.take(address("status", "controller"), STATUS.encode(), NOW)
-    assert controllers.topic == "/aero/status/controller"
+    assert said(found["/aero/status/plant"]) == json.loads(STATUS.encode())
     entities = [fields(entity) for entity in fields(found["/aero/scene"].data)[2]]
     assert [entity[2] for entity in entities] == [[b"aero"], [b"aero_desired"], *[[b"world"]] * stands]
     assert all(entity[5] == [1] for entity in entities)  # frame_locked: it moves with its frame
-    assert len({entity[3][0] for entity in entities}) == len(entities)
-    for entity in entities[:2]:
-        assert len(entity.get(10, [])) == rotors
-        assert len(entity[8]) >= 1
+    assert [len(entity.get(10, [])) for entity in entities[:2]] == [rotors, rotors]
 
 
 @pytest.mark.parametrize(
     ("name", "message", "level", "words"),
     [
         ("event", Event(role="plant", kind="tripped", text="over 60°"), 4, b"tripped: over 60\xc2\xb0"),
-        ("event", Event(role="controller", kind="lost", text="no measurement"), 3, b"lost: no measurement"),
         ("event", Event(role="controller", kind="claimed", text="aero"), 2, b"claimed: aero"),
         ("loss", Loss(key="k", count=7, reason="disk"), 3, b"7 messages of k"),
     ],
@@ -175,51 +171,37 @@ def test_the_rows_of_each_end_give_what_it_sent_as_frames_do_at_the_times_of_sen
 
 def test_frames_give_nothing_before_a_description_and_are_read_by_the_plants() -> None:
     decoder, payload = Decoder(None), measurement(*sent_vector(ATTITUDE), 0, 0, 0)
-    malformed, shown = [], []
-    steps: tuple[list[Description], ...] = (
-        [],
-        [description("recorder")],
-        [description("controller", "wire.attitude.bits=12")],
-        [description("plant"), description("controller", "wire.attitude.bits=12")],
-    )
+    plant, controller = description(SETTINGS, "plant"), description(load(None, ["wire.attitude.bits=12"]), "controller")
+    found = []
+    steps: tuple[list[Description], ...] = ([], [description(SETTINGS, "recorder")], [controller], [plant, controller])
     for descriptions in steps:
         for one in descriptions:
             decoder.configure(one)
-        shown.append(len(decoder.take(address("measurement"), payload, NOW)))
-        malformed.append(decoder.malformed)
-    assert (shown, malformed) == ([0, 0, 0, 3], [0, 0, 1, 1])
-
-
-def test_a_description_of_another_version_changes_nothing_and_is_counted() -> None:
-    decoder = configured()
-    for config in ({"wire": {"bits": 3}}, {}):
-        decoder.configure(Description(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config=config))
+        found.append((len(decoder.take(address("measurement"), payload, NOW)), decoder.malformed))
+    assert found == [(0, 0), (0, 0), (0, 1), (3, 1)]
+    other_version = plant.model_copy(update={"protocol": 1, "config": {"wire": {"bits": 3}}})
+    decoder.configure(other_version)
     assert decoder.malformed == 2
-    assert decoder.take(address("measurement"), RAW["measurement"], NOW)
+    assert decoder.take(address("measurement"), payload, NOW)
 
 
 # ── at which rate ──
 
 
-def test_a_topic_that_streams_gives_at_most_so_many_a_second_by_time_of_publication() -> None:
+def test_a_topic_that_streams_gives_at_most_so_many_a_second_by_time_of_publication_and_one_that_does_not_all() -> None:
     decoder, times = configured(30.0), range(NOW, NOW + 3 * 10**9, 1_000_000)
     shown = [at_ns for at_ns in times if decoder.take(address("truth"), RAW["truth"], at_ns)]
     assert len(shown) == pytest.approx(90, abs=1)
     assert max(b - a for a, b in pairwise(shown)) < 2 / 30 * 1e9
     assert decoder.take(address("truth"), RAW["truth"], NOW - 3600 * 10**9), "after its clock was set back"
-
-
-def test_without_a_rate_everything_is_given_and_what_happens_once_whatever_the_rate() -> None:
-    for rate_hz, names in ((None, list(RAW)), (0.001, ["event", "loss", "status"])):
-        decoder = configured(rate_hz)
-        assert all(decoder.take(address(name), RAW[name], NOW + k) for name in names for k in range(5))
+    assert all(decoder.take(address(name), RAW[name], NOW) for name in ("event", "loss", "status") for _ in range(5))
 
 
 @given(times=st.lists(st.integers(0, 3000), max_size=60).map(sorted), cuts=st.sets(st.integers(1, 59)))
 def test_of_the_rows_in_a_slot_of_time_the_first_is_given_however_they_are_batched(
     times: list[int], cuts: set[int]
 ) -> None:
-    """Times in ms; at 10 Hz."""
+    """Times [ms], at 10 Hz."""
     rows = [(NOW + ms * 1_000_000, Sent.FRAME, RAW["measurement"]) for ms in times]
     edges = [0, *sorted(cut for cut in cuts if cut < len(rows)), len(rows)]
     decoder = configured(10.0)
@@ -236,7 +218,7 @@ def test_of_the_rows_in_a_slot_of_time_the_first_is_given_however_they_are_batch
 # ── what is broken ──
 
 
-def test_rows_of_another_wire_spec_are_counted_and_those_of_no_time_are_left_out() -> None:
+def test_rows_of_another_wire_spec_are_counted_those_of_no_time_are_left_out_and_numbers_beyond_bounds_null() -> None:
     other = load(None, ["wire.attitude.bits=12"]).wire
     decoder = configured()
     rows = [(NOW, Sent.FRAME, bytes(other.measurement.size))]
@@ -245,6 +227,9 @@ def test_rows_of_another_wire_spec_are_counted_and_those_of_no_time_are_left_out
     payload = bytearray(RAW["trace"])
     payload[40:48] = (-(2**62)).to_bytes(8, "little", signed=True)  # the header's wall clock
     assert configured().take(address("trace"), bytes(payload), NOW) == []
+    text = RAW["telemetry"].replace(b"[0.0,0.0349", b"[1e999,0.0349")
+    found = by_topic(configured().take(address("telemetry"), text, NOW))
+    assert said(found["/aero/tracking"])["error_p_deg_s"] is None
 
 
 @given(
@@ -259,7 +244,87 @@ def test_any_bytes_at_any_time_give_something_or_are_counted_and_never_raise(
     assert bool(decoder.take(address(name), payload, at_ns)) != bool(decoder.malformed)
 
 
-def test_numbers_beyond_all_bounds_are_null() -> None:
-    text = RAW["telemetry"].replace(b"[0.0,0.0349", b"[1e999,0.0349")
-    found = by_topic(configured().take(address("telemetry"), text, NOW))
-    assert said(found["/aero/tracking"])["error_p_deg_s"] is None
+# ── schemas ──
+
+
+def readable(schema: dict[str, Any]) -> bool:
+    """Whether Lichtblick reads it: its parseJsonSchema.ts."""
+    match schema.get("type"):
+        case "object":
+            return all(readable(field) for field in schema["properties"].values())
+        case "array":
+            return schema["items"]["type"] != "array" and readable(schema["items"])
+        case kind:
+            return kind in ("boolean", "string", "number", "integer") and not {"oneOf", "anyOf", "$ref"} & set(schema)
+
+
+TYPES: dict[str, type | tuple[type, ...]] = {
+    "boolean": bool, "string": str, "number": (int, float), "integer": int, "array": list, "object": dict
+}  # fmt: skip
+
+
+def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:
+    decoder = configured()
+    assert set(RAW) == {
+        topic.name for topic in topics.TOPICS.values() if topic.decoded or topic.kind in ("frame", "trace")
+    }
+    given = [shown for name, payload in RAW.items() for shown in decoder.take(address(name), payload, NOW)]
+    given += decoder.take(address("status", "controller"), STATUS.encode(), NOW)
+    given += decoder.take(address("status", "recorder"), STATUS.encode(), NOW)
+    assert {shown.topic: shown.shape for shown in given} == {f"/aero/{name}": shape for name, shape in SHAPES.items()}
+    for shown in given:
+        if shown.shape.encoding == "jsonschema":
+            schema, message = json.loads(shown.shape.schema), said(shown)
+            assert set(message) == set(schema["properties"])
+            for name, value in message.items():
+                assert value is None or isinstance(value, TYPES[schema["properties"][name]["type"]]), name
+
+
+def test_every_schema_is_one_that_viewers_read() -> None:
+    for name, shape in SHAPES.items():
+        if shape.encoding == "jsonschema":
+            assert readable(json.loads(shape.schema)), name
+            continue
+        package, _, message = shape.name.partition(".")
+        files = [fields(file) for file in fields(shape.schema)[1]]  # a FileDescriptorSet
+        declared = {(file[2][0].decode(), fields(found)[1][0].decode()) for file in files for found in file.get(4, [])}
+        assert (package, message) in declared, name
+
+
+# ── layout ──
+
+
+def leaves(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+
+
+@pytest.mark.parametrize(("vehicle", "actuators", "motors"), [("aero", 2, {2, 3}), ("bench.2", 3, {1, 2, 3})])
+def test_every_path_is_a_field_of_a_topic_that_is_decoded_and_voltages_are_those_of_the_motors_there_are(
+    vehicle: str, actuators: int, motors: set[int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A topic with a dot in it stands in quotes."""
+    assert execute(["show", "layout", "--set", f"vehicle={vehicle}", "--set", f"wire.actuators={actuators}"]) == 0
+    panels = json.loads(capfd.readouterr().out)["configById"].values()
+    found = [path["value"] for panel in panels for path in panel.get("paths", [])]
+    for path in found:
+        parts = re.fullmatch(
+            r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
+        )
+        assert parts is not None, path
+        assert (parts["vehicle"], parts["q"]) == (vehicle, '"' if "." in vehicle else ""), path
+        assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
+    shown = {path.rpartition(".")[2] for path in found}
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "p99", "state"} <= shown
+    assert {field for field in shown if field.startswith("voltage")} == {f"voltage_{i}_v" for i in motors}
+
+
+def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws_and_every_panel_has_its_place() -> None:
+    made = json.loads(layout("aero", WireSpec().motors))
+    panels = made["configById"]
+    assert sorted(leaves(made["layout"])) == sorted(panels)
+    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
+    assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
+    assert SHAPES["scene"].name == "foxglove.SceneUpdate"
+    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
+    assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"
