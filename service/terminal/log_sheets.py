@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from math import log2
 from typing import TYPE_CHECKING, Final
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.report import rows
 from aeroloop.service.report.rows import count, grave, missing
-from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, Spread, differences
+from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, differences
 from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
@@ -28,7 +27,13 @@ DISAGREEMENTS_SHOWN: Final = 5
 SESSIONS_SHOWN: Final = 9
 DAMAGES_SHOWN: Final = 20
 UNSEEN_SHOWN: Final = 3
-_BARS: Final = "▁▂▃▄▅▆▇█"
+
+LAPSES: Final = {
+    "late": "late measurements", "malformed": "malformed measurements", "stale": "stale commands",
+    "repeated": "repeated commands", "refused": "refused commands",
+    "withheld": "commands dropped or delayed by a fault", "missed": "measurements that the controller missed",
+}  # fmt: skip
+"""What `Findings.lapses` counts."""
 
 
 def figure_sheets(figures: Figures) -> Sheets:
@@ -61,7 +66,7 @@ def review_sheets(findings: Findings) -> Sheets:
     durations: list[Row] = []
     for each in rows.durations([findings]):
         percentiles = dict(zip(rows.PERCENTILES.values(), each.percentiles, strict=True))
-        durations.append({"": each.label, **percentiles, "spread": sparkline(each.spread) if each.spread else ""})
+        durations.append({"": each.label, **percentiles})
     if durations:
         yield "", durations
     yield "", [{"of the log": label, "found": text} for label, text in _details(findings)]
@@ -100,20 +105,6 @@ def comparison_sheets(reports: Sequence[Report]) -> Sheets:
         yield "\n".join(lines), []
 
 
-def sparkline(spread: Spread, width: int = 12) -> str:
-    """The distribution as a row of bars: logarithm of the count over logarithm of the duration.
-
-    Why logarithms: a single late tick in a million stays visible.
-    """
-    first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
-    counts = [0] * width
-    for edge, n in spread.bins:
-        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += n
-    top = log2(1 + max(counts))
-    bars = (_BARS[round(log2(1 + n) / top * (len(_BARS) - 1))] if n else " " for n in counts)
-    return "".join(bars).rstrip()
-
-
 def _one_run(run: Figures) -> list[Row]:
     found = [
         (figure, value)
@@ -142,10 +133,7 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
         if n:
             yield f"invalid {name}s", str(n)
     if findings.lapses:
-        yield "irregular ticks", ", ".join(f"{n} {name}" for name, n in findings.lapses.items())
-    if findings.clock_offset_us is not None:
-        first, last = findings.clock_offset_us
-        yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
+        yield "frames and ticks", ", ".join(f"{LAPSES[name]}: {n:,}" for name, n in findings.lapses.items())
     for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
@@ -198,7 +186,8 @@ def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
         alike.setdefault((mark.role, mark.kind, text), []).append((when, mark))
     found = []
     for (when, first), *more in alike.values():
-        again = f" (and {len(more)} more like it, the last: {more[-1][0]})" if more else ""
+        last = more[-1][0].replace("after", "after the session") if more else ""
+        again = f" ({count(1 + len(more), 'such event')} in all, the last: {last})" if more else ""
         found.append(_event(when, first.role, first.kind, first.text + again))
     return found
 
