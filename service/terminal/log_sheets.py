@@ -149,11 +149,8 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "vehicles", f"{', '.join(vehicles)}; shown is {findings.vehicle}, --vehicle shows another"
     its = [one for one in findings.recorded if one.vehicle == findings.vehicle]
     if len(its) > 1:
-        for i, one in enumerate(its, 1):
-            shown = ", shown" if one.session == findings.session else ""
-            if shown or i <= SESSIONS_SHOWN:
-                yield "sessions" if i == 1 else "", f"{i}  {one.session}, {one.duration_s:.1f} s{shown}"
-        yield "", f"--session N shows another of {len(its)}"
+        listed = [f"{i} is {one.session}, {one.duration_s:.1f} s" for i, one in enumerate(its, 1)]
+        yield "sessions", f"{'; '.join(_some(listed, SESSIONS_SHOWN))}; --session N shows another"
 
 
 def _fault(fault: FaultInterval) -> Row:

@@ -19,7 +19,7 @@ VERBS: Final[dict[str, tuple[str, ...]]] = {
     "export --format csv": ("log", "export", "a.mcap", "--format", "csv", "--out", "OUT"),
     "export --format mcap": ("log", "export", "a.mcap", "--format", "mcap", "--out", "OUT"),
     "recover": ("log", "recover", "a.mcap", "OUT"),
-    "burden --figure": ("lab", "burden", "--figure", "OUT", "--duration", "0.1", "--bits", "6/4", "--sensors", "gyro"),
+    "burden --figure": ("lab", "burden", "--figure", "OUT", "--duration", "0.1", "--bits", "6/4"),
 }
 """Every verb that writes a file that the user names."""
 
