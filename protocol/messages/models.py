@@ -257,12 +257,11 @@ class Event(Message):
     tick: int | None = Field(default=None, description="the session's tick at which it happened, if any")
 
 
-LossReason = Literal["cache", "gone", "end", "disk"]
+LossReason = Literal["cache", "gone", "end"]
 LOSS_REASONS: Final[dict[LossReason, str]] = {
     "cache": "not received, and no longer in their publisher's cache",
     "gone": "not received, and their publisher does not answer",
     "end": "not received, and still in their publisher's cache when recording ended",
-    "disk": "received, and the log could not be written",
 }
 """Why messages are not in a log."""
 

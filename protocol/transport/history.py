@@ -26,7 +26,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, LossReason
 
 KEPT_S: Final = 65.0  # for so long publishers keep what they publish; one that has been silent for so long is gone
-ANSWER_S: Final = 3.0  # time-out of a query; what has been silent for so long cannot be reached now
+ANSWER_S: Final = 3.0  # time-out of a query
 SOON_S, SELDOM_S = 0.025, 0.5  # pause between two queries while pages bring messages, and else
 PAGE_BYTES: Final = 16_384  # of a page with more than one message: 64 kbit/s carry it in 2 s
 WAITING_BYTES: Final = 8_388_608  # that wait to be taken, with 200 for each message; what finds no room stays lacking
@@ -191,14 +191,14 @@ class RecoveringSubscriber:
     def complete(self, since: float | None = None) -> bool:
         """Whether a query after `since` [s], or else the last, is answered, and nothing lacks that can be reached."""
         with self._lock:
-            lacks = any(source.lacks and self._age(source) < ANSWER_S for source in self._sources.values())
+            lacks = any(source.lacks and self._reachable(source) for source in self._sources.values())
             return self._complete >= (self._asked if since is None else since) and not lacks
 
     def losses(self, *, finished: bool = False) -> list[Loss]:
         """Losses since the last call; if `finished`, all that is lacking is lost."""
         with self._lock:
             for source in self._sources.values() if finished else ():
-                there = self._age(source) < ANSWER_S and source.answered
+                there = self._reachable(source) and source.answered
                 self._give_up(source, source.end, "end" if there else "gone")
             lost, self._lost = self._lost, Counter()
         return [Loss(key=key, count=count, reason=reason) for (key, reason), count in lost.items()]
@@ -206,11 +206,15 @@ class RecoveringSubscriber:
     def silent(self) -> dict[str, float]:
         """For how long nothing was received of publishers that cannot be reached and may still have messages [s]."""
         with self._lock:
-            ages = {source.key: self._age(source) for source in self._sources.values()}
-        return {key: age for key, age in ages.items() if ANSWER_S < age < KEPT_S}
+            ages = {one.key: self._age(one) for one in self._sources.values() if not self._reachable(one)}
+        return {key: age for key, age in ages.items() if age < KEPT_S}
 
     def _age(self, source: _Source) -> float:
         return self._clock() - source.seen
+
+    def _reachable(self, source: _Source) -> bool:
+        """Whether it has been silent for less than two time-outs: a query or a page that is dropped is repeated once."""
+        return self._age(source) < 2 * ANSWER_S
 
     def _query(self) -> None:
         """Query the caches for what is lacking, of each publisher the newest first, or else for what is newer."""

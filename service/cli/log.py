@@ -83,8 +83,9 @@ def review(
     if figures is not None:
         from aeroloop.service.report.plots import draw_figures
 
-        with writing_into(figures, logs, force=force) as folder:
-            drawn = draw_figures(judged.report(), judged.settings, folder)
+        drawing = progress_bar("drawing", 1, hidden=json)
+        with writing_into(figures, logs, force=force) as folder, drawing as update:
+            drawn = draw_figures(judged.report(), judged.settings, folder, update)
         names = ", ".join(dict.fromkeys(path.stem for path in drawn))
         typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
     if html is not None:

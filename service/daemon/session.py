@@ -248,7 +248,7 @@ class Session:
         counts.sent += bool(command)
         counts.skipped += now.missed
         if now.missed >= STALL_TICKS:
-            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self.name, now.tick)
+            self._role.warn("stall", "fault", f"{now.missed} ticks missed in a row", self.name, now.tick)
 
     def _advance_state(self, tick: int, fault: str | None) -> None:
         machine, role = self._shared.machine, self._role

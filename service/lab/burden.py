@@ -284,7 +284,8 @@ def _marks(color: str, face: str = "white") -> dict[str, Any]:
 
 
 def _draw(panel: Axes, points: list[Row], looks: dict[str | None, tuple[str, str]]) -> None:
-    front = sorted((point["bits_per_s"] / 1e3, 1e4 * point["z_track"], point) for point in points if point["pareto"])
+    ahead = [point for point in points if point["pareto"]]
+    front = sorted(((one["bits_per_s"] / 1e3, 1e4 * one["z_track"], one) for one in ahead), key=lambda each: each[:2])
     panel.plot(*zip(*(place for *place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)
     for point in points:
         (color, marker), error = looks[point["quantizer"]], 1e4 * point["z_track"]

@@ -146,10 +146,10 @@ def _write_table(
         "exported_by": versions(),
     }
     states, malformed = TrueStates({which[1]: recording.settings(which).wire.actuators for which in chosen}), 0
-    truth = "truth", chosen[0][0]
-    for _, message in recording.messages(lambda address: (address.topic.name, address.vehicle) == truth or None):
+    for address, message in recording.messages:
         try:
-            states.add(message.data)
+            if (address.topic.name, address.vehicle) == ("truth", chosen[0][0]):
+                states.add(message.data)
         except ValueError:
             malformed += 1
     pieces = _pieces(recording, chosen, times_s, states)

@@ -14,7 +14,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final
 
 import zstandard
 from mcap.exceptions import McapError
@@ -50,9 +50,6 @@ _CHECKSUM: Final = "crc32"
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of a record
 _FOOTER: Final = struct.Struct("<BQQQI8s")  # with its head, and the magic after it
 _MALFORMED: Final = (struct.error, ValueError, OverflowError, McapError, zstandard.ZstdError)
-
-
-T = TypeVar("T")
 
 
 class NotMcapError(ValueError):
@@ -98,16 +95,6 @@ def records(
                 last_ns = max((one.log_time for one in found if isinstance(one, Message)), default=last_ns)
             if progress is not None:
                 progress(file.tell())
-
-
-def messages(path: Path, wanted: Callable[[Channel], T | None]) -> Iterator[tuple[T, Message]]:
-    """Messages of some channels, each with what `wanted` returns for its channel; None skips the channel."""
-    answers: dict[int, T | None] = {}
-    for one in records(path):
-        if isinstance(one, Channel) and one.id not in answers:
-            answers[one.id] = wanted(one)
-        elif isinstance(one, Message) and (answer := answers.get(one.channel_id)) is not None:
-            yield answer, one
 
 
 def with_checksum(name: str, entries: dict[str, str]) -> dict[str, str]:

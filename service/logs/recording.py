@@ -1,7 +1,7 @@
 """A recording: the files of a run (one, a folder, or those of a rotated run) read as one.
 
-The files are read once for descriptions and traces, whose batches stay in memory (140 MB an hour at 500 Hz), and again
-for the JSON messages of some keys.
+The files are read once: descriptions, the traces' batches (140 MB an hour at 500 Hz) and what readers want of the JSON
+messages stay in memory, until `release`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil, inf
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from mcap.records import Channel, Message, Metadata
 
@@ -29,7 +29,7 @@ Progress = Callable[[float], None]
 """Called repeatedly with the share done, 0…1."""
 
 INDEXING: Final = 0.4
-"""Share of the progress that the first look at the files takes."""
+"""Share of the progress that reading the files takes."""
 
 ANSWER_S: Final = 1.2
 """Longest time from a measurement until its command acts; a session's first may take a second [s]."""
@@ -38,7 +38,8 @@ OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
 """Sections of the configuration by the role that owns them; the others are the controller's. Why: every process is
 configured by itself: the controller's copy of `plant.mass` may differ from the plant's."""
 
-T = TypeVar("T")
+MESSAGES: Final = ("event", "loss", "status", "truth")
+"""Topics whose messages are read beside the traces."""
 
 
 class ReviewError(AeroloopError):
@@ -50,7 +51,7 @@ class Recording:
 
     Args:
         paths: Files and folders; of a folder, every `.mcap` in it.
-        progress: Called repeatedly with the share done: the first look at the files takes `INDEXING` of it.
+        progress: Called repeatedly with the share done: reading the files takes `INDEXING` of it.
 
     Attributes:
         paths: The files, in the order of their first messages.
@@ -58,6 +59,7 @@ class Recording:
         extents: Recorded extent of each session, in the order of recording.
         missing: Rows that the log lacks.
         unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
+        messages: Messages of the topics MESSAGES with their keys, in the order of recording.
         damaged: What of the files is cut or damaged, a line each.
         malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
 
@@ -67,6 +69,7 @@ class Recording:
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.metadata: dict[str, dict[str, Any]] = {}
+        self.messages: list[tuple[Address, Message]] = []
         self.damaged: list[str] = []
         self.malformed: Counter[str] = Counter()
         self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
@@ -152,9 +155,10 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
-        controller, states, left_out = table_of("controller", settings.wire, computed)
+        payloads = memoryview(self._index.payloads)
+        controller, states, left_out = table_of("controller", settings.wire, computed, payloads)
         its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
-        plant, _, more_left_out = table_of("plant", settings.wire, its)
+        plant, _, more_left_out = table_of("plant", settings.wire, its, payloads)
         self.malformed["trace"] += left_out + more_left_out
         for gap in unknown:
             plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
@@ -214,30 +218,21 @@ class Recording:
             return None
         return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
 
-    # ── what else is in the files ──
+    # ── the plant's processes ──
 
     def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
         """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
         for source, entries in self._index.entries.items():
             if source.end == "plant" and entries:
-                batches = [batch for one in entries if (batch := read_batch(one.payload)) is not None]
+                payloads = (bytes(self._index.payloads[one.place]) for one in entries)
+                batches = [batch for payload in payloads if (batch := read_batch(payload)) is not None]
                 yield source, self._described_at(source.vehicle, "plant", self._begun_ns[source]), batches
 
-    def messages(self, wanted: Callable[[Address], T | None]) -> Iterator[tuple[T, Message]]:
-        """Messages of the keys that `wanted` selects, in the order of recording, each with its result for the key.
+    def release(self) -> None:
+        """Free batches and messages, once all that is wanted of them is read: no other session can be read then."""
+        self._index, self.messages = TraceIndex(), []
 
-        It is called once per key of a file; None drops the key.
-        """
-        for path in self.paths:
-            answers: dict[int, T | None] = {}
-            for one in records(path):
-                if isinstance(one, Channel) and one.id not in answers:
-                    address = topics.read_key(one.topic)
-                    answers[one.id] = None if address is None else wanted(address)
-                elif isinstance(one, Message) and (answer := answers.get(one.channel_id)) is not None:
-                    yield answer, one
-
-    # ── the first look at the files ──
+    # ── the look at the files ──
 
     def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> set[object]:
         """Read a file's metadata, descriptions and traces; returns what marks its run, nothing without a trace."""
@@ -269,6 +264,8 @@ class Recording:
                         marks |= {source, which} if session else {source}
                         for one in (source, (which, source.end)):
                             self._begun_ns[one] = min(self._begun_ns.get(one, record.publish_time), record.publish_time)
+                    elif address.topic.name in MESSAGES:
+                        self.messages.append((address, record))
         self.damaged += [f"{path}: {damage}" for damage in damages]
         return marks and {*marks, identity}
 

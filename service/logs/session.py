@@ -99,7 +99,7 @@ class Session:
         extent: What was recorded of it.
         controller: Columns tick, received_as, sent_as, received, sent, wall, measurement, command.
         plant: Columns tick, session_tick, sent_as, received_as, outcome, trip, answered (−1 for none), sent, received,
-            wall, measurement, command, voltages [V].
+            wall, measurement, command.
         changes: Changes of gains and reference, in the order of their ticks.
         states: The controller's state before its first row and each first row after a gap, by the row's index.
         missing: Rows that the log lacks.
@@ -130,7 +130,7 @@ class Entry(NamedTuple):
     """A batch of a trace, as it was recorded."""
 
     header: Header
-    payload: bytes
+    place: slice  # where its bytes are in `TraceIndex.payloads`
     first: int  # tick of the first row
     last: int  # highest tick; a late row is of an earlier one
     proof: int  # a tick of the other end whose row there must be
@@ -143,7 +143,9 @@ class Entry(NamedTuple):
         return self.header.first_row + self.header.rows
 
 
-def table_of(end: End, wire: WireSpec, batches: Sequence[Entry]) -> tuple[Table, dict[int, dict[str, Any]], int]:
+def table_of(
+    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: memoryview
+) -> tuple[Table, dict[int, dict[str, Any]], int]:
     """One end's rows, from batches in order.
 
     Returns:
@@ -151,30 +153,33 @@ def table_of(end: End, wire: WireSpec, batches: Sequence[Entry]) -> tuple[Table,
     """
     sizes = wire.measurement.size, wire.command.size, wire.actuators
     fitting = [
-        (header, payload)
-        for header, payload, *_ in batches
-        if (header.measurement_bytes, header.command_bytes, header.actuators) == sizes
+        one
+        for one in entries
+        if (one.header.measurement_bytes, one.header.command_bytes, one.header.actuators) == sizes
     ]
     kinds = row_dtype(end, *sizes)
     wide = {"tick", "session_tick", "answered", "received", "sent"}
-    columns = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or ()]
-    table = np.zeros(sum(header.rows for header, _ in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
+    columns = [
+        (name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or () if name != "voltages"
+    ]
+    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
     states = dict[int, dict[str, Any]]()
     filled, next_row = 0, -1
-    for header, payload in fitting:
+    for entry in fitting:
+        header, payload = entry.header, bytes(payloads[entry.place])
         batch = Batch(header, read_columns(header, payload), Tail())
         if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
             states[filled] = whole.tail.state
-        next_row = header.first_row + header.rows
+        next_row = entry.after
         rows = table[filled : filled + header.rows]
-        for name, column in batch.columns.items():
-            rows[name] = column
+        for name, _ in columns:
+            rows[name] = batch.columns[name]
         rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
         rows["wall"] = header.wall_ns - header.monotonic_ns
         filled += header.rows
     if end == "plant":
         table["answered"][table["answered"] == NEVER] = NO_TICK
-    return table, states, len(batches) - len(fitting)
+    return table, states, len(entries) - len(fitting)
 
 
 def join(
@@ -183,8 +188,8 @@ def join(
     """Ticks from `first` to `last` and the rows of each: k, at_controller, at_plant and acted of `Session`."""
     computed = np.flatnonzero(np.isin(controller["received_as"], (Received.FRAME, Received.SILENT)))
     acting = np.flatnonzero((plant["outcome"] == Outcome.ACTED) & (plant["answered"] != NO_TICK))
-    k = np.unique(np.concatenate([controller["tick"][computed], plant["session_tick"]]))
-    k = k[(k >= first) & (k <= last)]
+    k = np.sort(np.concatenate([controller["tick"][computed], plant["session_tick"]]))
+    k = k[(np.diff(k, prepend=NO_TICK) > 0) & (k >= first) & (k <= last)]  # `unique` would keep 30 bytes a tick
     return (
         k,
         _places(controller["tick"][computed], computed, k),

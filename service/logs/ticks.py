@@ -185,25 +185,34 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
     frames = np.concatenate([plant["measurement"][at_plant[by_plant]], controller["measurement"][at[by_controller]]])
     answered = np.isin(sent_as, (Sent.FRAME, Sent.SILENT)) | (session.acted >= 0)
     until = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
-    table, widths, missed = _computed(session, progress)
-    valid = ~np.isnan(table[:until, widths[0]])  # where q was measured
-    judged: slice | Integers = slice(until) if valid.all() else np.flatnonzero(valid)  # a slice copies nothing
+    # what takes memory for a while comes before the table of all that is computed, 400 MB an hour
+    measurements = codes_in(wire.measurement, frames)
+    commands = codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]])
     wall, sent, latency, there, back, offset_ns = _timed(session)
     volts = _voltages(session)
-    columns = [np.asarray(part) for part in np.split(table[judged], np.cumsum(widths)[:-1], axis=1)]
+    table, widths, missed = _computed(session, progress)
+    valid = ~np.isnan(table[:until, widths[0]])  # where q was measured
+    judged: slice | Integers = slice(until)  # of most sessions all ticks are valid: a slice copies nothing
+    if not valid.all():
+        judged = np.flatnonzero(valid)
+        for column in table.T:  # in place, one after the other
+            column[: len(judged)] = column[judged]
+    table = table[: int(valid.sum())]
+    columns = [np.asarray(part) for part in np.split(table, np.cumsum(widths)[:-1], axis=1)]
     state, q, state_next, desired, rate, attitude_error, rate_error, unquantized = columns
     k, gains = session.k[judged], _gains(session, session.k[judged])
+    commanded_at = slice(until) if answered[:until].all() else answered
     return Recomputed(
         ticks=Ticks(
             k, wall[judged], sent[judged], latency[judged], there[judged], back[judged], q, desired, rate,
             attitude_error, rate_error, volts[judged], unquantized, gains, state, state_next,
         ),
-        answered=session.k[answered],
-        voltages=volts[answered],
+        answered=session.k[commanded_at],
+        voltages=volts[commanded_at],
         missed=session.k[missed[missed < until]],
         unsent=(int((valid & ~(by_plant | by_controller)[:until]).sum()), int((sent_as == Sent.SILENT).sum())),
-        measurements=codes_in(wire.measurement, frames),
-        commands=codes_in(wire.command, controller["command"][at[sent_as == Sent.FRAME]]),
+        measurements=measurements,
+        commands=commands,
         offset_ns=offset_ns,
     )  # fmt: skip
 

@@ -48,6 +48,8 @@ class TraceIndex:
         unknown: Ticks whose gains, reference or law's state the log does not hold.
         entries: Batches of each process, in the order of its rows, none twice.
         parts: Batches of each session and end, likewise.
+        payloads: All batches, one after another; see `Entry.place`. One object, as an hour is 140 MB, which many small
+            ones would not return to the system.
         malformed: Batches that are malformed, or of no process of the session.
     """
 
@@ -58,8 +60,9 @@ class TraceIndex:
         self.unknown: list[Unknown] = []
         self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)
         self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)
+        self.payloads = bytearray()
         self.malformed = 0
-        self._known: set[tuple[Source, bytes]] = set()
+        self._known: set[int] = set()
 
     def add(self, vehicle: str, payload: bytes) -> tuple[Source, str] | None:
         """Add a batch, once; returns its process and session. A malformed one is dropped and counted."""
@@ -69,11 +72,13 @@ class TraceIndex:
             return None
         header, tail = batch.header, batch.tail
         source = Source(vehicle, header.end, header.run)
-        if (source, payload) not in self._known:
-            self._known.add((source, payload))
+        if (identity := hash((source, payload))) not in self._known:
+            self._known.add(identity)
             changes = [change for change in tail.changes if change.session == header.session]
             record = tail.record if all(change.session == header.session for change in tail.record) else []
-            self.entries[source].append(Entry(header, payload, *_ticks(batch), changes, record))
+            place = slice(len(self.payloads), len(self.payloads) + len(payload))
+            self.payloads += payload
+            self.entries[source].append(Entry(header, place, *_ticks(batch), changes, record))
         return source, header.session
 
     def finish(self) -> None:

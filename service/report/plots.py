@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from aeroloop.service.config import Settings
-from aeroloop.service.logs.recording import ReviewError
+from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.report.figure_style import BLUE, GREEN, ORANGE, WIDTH_IN, figure_style, save
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
@@ -32,17 +32,19 @@ TRUE: Final[dict[str, Any]] = {"color": GREEN, "linewidth": 0.9, "linestyle": (0
 DIGITS: Final = str.maketrans("₁₂₃", "123")
 
 
-def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]:
+def draw_figures(report: Report, settings: Settings, folder: Path, progress: Progress | None = None) -> list[Path]:
     """Draw what a report has, each figure as PDF, SVG and PNG, and return the paths.
 
-    The settings are its controller's. Raises ReviewError if the session has no ticks, OSError if the folder cannot be
-    written.
+    The settings are its controller's; `progress` is called with the share done before each figure. Raises ReviewError
+    if the session has no ticks, OSError if the folder cannot be written.
     """
     if not len(report.time):
         raise ReviewError("the log has no answered measurement to draw")
     case, paths = case_of(settings), list[Path]()
     with figure_style():
-        for name in FIGURES:
+        for i, name in enumerate(FIGURES):
+            if progress is not None:
+                progress(i / len(FIGURES))
             panels = [panel for panel in report.panels if panel.group == name]
             if not panels:
                 continue

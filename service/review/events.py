@@ -18,7 +18,6 @@ import numpy as np
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Event, Loss, Status
 from aeroloop.protocol.messages.operator import Change, in_words
-from aeroloop.protocol.messages.topics import Address
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, TrueStates
 from aeroloop.service.review.report import FaultInterval, Mark
@@ -59,16 +58,13 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
     published = list[tuple[int, str, Event | Loss | Status]]()
     states = TrueStates({which[1]: actuators})
 
-    def wanted(address: Address) -> Address | None:
-        name = address.topic.name
-        return address if name in _MODELS or (name == "truth" and address.vehicle == which[0]) else None
-
-    for address, found in recording.messages(wanted):
+    for address, found in recording.messages:
         at_ns = found.publish_time
         name = address.topic.name
         try:
             if name == "truth":
-                states.add(found.data)
+                if address.vehicle == which[0]:
+                    states.add(found.data)
             elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
                 known.add(identity)
                 message = _MODELS[name].model_validate_json(found.data)

@@ -145,6 +145,8 @@ class Limit(NamedTuple):
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if f"{self.path}.".startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
+        if self.path == "theorem.held" and value is not None:
+            found = "the run kept to all that is proven" if value else "the run broke what is proven"
         permitted = {limit.path for limit in limits if limit.holds(findings)}
         unseen = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
         if self.holds(findings) and unseen:

@@ -97,6 +97,7 @@ def read(
         since, until = since_s / loop.period, until_s / loop.period
         unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
     messages = read_messages(recording, which, settings.wire.actuators)
+    recording.release()
     events, faults = happened(messages, its, span, session is not None), fault_intervals(messages, its)
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     ticks, went = judged.ticks, lapses(its, judged.missed)

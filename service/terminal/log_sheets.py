@@ -28,6 +28,13 @@ SESSIONS_SHOWN: Final = 9
 DAMAGES_SHOWN: Final = 20
 UNSEEN_SHOWN: Final = 3
 
+LAPSES: Final = {
+    "late": "late measurements", "malformed": "malformed measurements", "stale": "stale commands",
+    "repeated": "repeated commands", "refused": "refused commands",
+    "withheld": "commands dropped or delayed by a fault", "missed": "measurements that the controller missed",
+}  # fmt: skip
+"""What `Findings.lapses` counts."""
+
 
 def figure_sheets(figures: Figures) -> Sheets:
     """Main figures of merit of one run, each that is missing with its reason; its trips, damages and log."""
@@ -126,7 +133,7 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
         if n:
             yield f"invalid {name}s", str(n)
     if findings.lapses:
-        yield "irregular ticks", ", ".join(f"{n} {name}" for name, n in findings.lapses.items())
+        yield "frames and ticks", ", ".join(f"{LAPSES[name]}: {n:,}" for name, n in findings.lapses.items())
     for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
@@ -176,7 +183,8 @@ def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
         alike.setdefault((mark.role, mark.kind, text), []).append((when, mark))
     found = []
     for (when, first), *more in alike.values():
-        again = f" (and {len(more)} more like it, the last: {more[-1][0]})" if more else ""
+        last = more[-1][0].replace("after", "after the session") if more else ""
+        again = f" ({count(1 + len(more), 'such event')} in all, the last: {last})" if more else ""
         found.append(_event(when, first.role, first.kind, first.text + again))
     return found
 

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from mcap.records import Channel
+from mcap.records import Message as Recorded
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
-from aeroloop.service.logs.mcap_file import messages
+from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.process_group import HilError
@@ -91,11 +92,14 @@ class HilLog:
         return [change for batch in self.batches("controller") for change in batch.tail.changes]
 
     def _published(self, topic: topics.Topic) -> list[tuple[int, bytes]]:
-        def wanted(channel: Channel) -> bool | None:
-            address = topics.read_key(channel.topic)
-            return True if address is not None and address.topic is topic else None
-
-        found = [(message.publish_time, message.data) for _, message in messages(self._existing(), wanted)]
+        addresses, found = dict[int, topics.Address | None](), list[tuple[int, bytes]]()
+        for record in records(self._existing()):
+            if isinstance(record, Channel):
+                addresses[record.id] = topics.read_key(record.topic)
+            elif isinstance(record, Recorded):
+                address = addresses.get(record.channel_id)
+                if address is not None and address.topic is topic:
+                    found.append((record.publish_time, record.data))
         return sorted(found, key=lambda each: each[0])
 
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:

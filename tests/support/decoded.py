@@ -128,7 +128,7 @@ RAW = {
     "reference": Setpoint(attitude=(0.0, 0.0, 0.0)).encode(),
     "status": STATUS.encode(),
     "event": Event(role="plant", kind="started", text="x").encode(),
-    "loss": Loss(key="k", count=1, reason="disk").encode(),
+    "loss": Loss(key="k", count=1, reason="cache").encode(),
     "trace": batch("plant", [(NOW, Sent.FRAME, measurement(0, 0, 0, 0, 0, 0))]),
 }
 """A message of every topic that is decoded."""

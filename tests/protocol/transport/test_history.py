@@ -185,7 +185,7 @@ def test_a_loss_says_what_is_known() -> None:
     for _ in range(10):
         made.publish()
     made.receive(made.publish())
-    made.now += ANSWER_S + 1
+    made.now += 2 * ANSWER_S + 1
     assert made.lost() == []
     made.now += KEPT_S
     made.take()
@@ -197,15 +197,30 @@ def test_what_cannot_be_reached_but_may_have_more_is_named_and_not_waited_for() 
     for number in (0, 2):
         made.receive(number)
     found, complete = [], []
-    for pause_s in (ANSWER_S - 0.1, 1.0, KEPT_S):
+    for pause_s in (2 * ANSWER_S - 0.1, 1.0, KEPT_S):
         made.take()
         made.queries.pop()[1].drop()  # answered by none
         complete.append(made.subscriber.complete())
         made.now += pause_s
         complete.append(made.subscriber.complete())
         found.append(made.subscriber.silent())
-    assert found == [{}, {KEY: pytest.approx(ANSWER_S + 0.9)}, {}]
+    assert found == [{}, {KEY: pytest.approx(2 * ANSWER_S + 0.9)}, {}]
     assert complete == [False, False, False, True, True, True]
+
+
+def test_a_query_that_is_dropped_is_repeated_before_its_publisher_counts_as_unreachable() -> None:
+    made = Made(200)
+    for _ in range(100):
+        made.publish()
+    made.receive(made.publish())
+    made.take()
+    made.now += ANSWER_S
+    made.queries.pop()[1].drop()
+    assert not made.subscriber.complete(0.0)
+    made.answer_all()
+    assert sorted(made.found) == list(range(101))
+    assert made.subscriber.complete(0.0)
+    assert made.lost(finished=True) == []
 
 
 def test_what_waits_is_bounded_and_what_finds_no_room_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:

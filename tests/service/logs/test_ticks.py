@@ -20,6 +20,7 @@ from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
 from aeroloop.service.logs.ticks import Ticks, recompute
 from aeroloop.service.review.review import review
+from aeroloop.service.testing.hil_log import HilLog
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws
 from tests.support.ideal import IDEAL
@@ -60,8 +61,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     names = list(initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)))
     at = {k: i for i, k in enumerate(ticks.k.tolist())}
     published = 0
-    for _, found in Recording([log]).messages(lambda address: address.topic.name == "telemetry" or None):
-        telemetry = Telemetry.model_validate_json(found.data)
+    for _, telemetry in HilLog(log).messages(Telemetry):
         i = at[telemetry.tick]
         assert bits(ticks.attitude_error[i]) == bits(telemetry.attitude_error)
         assert bits(ticks.rate_error[i]) == bits(telemetry.rate_error)

@@ -115,7 +115,7 @@ def test_rows_that_the_log_lacks_are_no_missed_ticks_and_are_unseen_where_they_a
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
     losses = (("s1/measurement", 3, 0.21), ("s1/measurement", 4, 0.41), ("event/plant", 1, 0.51))
     more = [
-        message_of("loss", Loss(key=f"aeroloop/aero/{key}", count=n, reason="disk"), START_NS + round(at_s * 1e9))
+        message_of("loss", Loss(key=f"aeroloop/aero/{key}", count=n, reason="cache"), START_NS + round(at_s * 1e9))
         for key, n, at_s in losses
     ]
     findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))

@@ -139,7 +139,7 @@ def test_a_status_is_shown_as_it_is_and_a_plants_brings_the_body_in_the_frame_th
     [
         ("event", Event(role="plant", kind="tripped", text="over 60°"), 4, b"tripped: over 60\xc2\xb0"),
         ("event", Event(role="controller", kind="claimed", text="aero"), 2, b"claimed: aero"),
-        ("loss", Loss(key="k", count=7, reason="disk"), 3, b"7 messages of k"),
+        ("loss", Loss(key="k", count=7, reason="cache"), 3, b"7 messages of k"),
     ],
 )
 def test_what_happens_is_a_line_of_the_log_of_the_role_in_its_key(
