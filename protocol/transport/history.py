@@ -213,7 +213,7 @@ class RecoveringSubscriber:
         return self._clock() - source.seen
 
     def _reachable(self, source: _Source) -> bool:
-        """Whether it has been silent for less than two time-outs: a query or a page that is dropped is repeated once."""
+        """Whether it was silent for less than two time-outs: a query or page that is dropped is repeated once."""
         return self._age(source) < 2 * ANSWER_S
 
     def _query(self) -> None:
