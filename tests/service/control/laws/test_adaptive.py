@@ -18,7 +18,6 @@ from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quate
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, equations, projection
 from aeroloop.service.control.laws.evaluation import law_function, received
-from aeroloop.service.control.laws.registry import LawError
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -50,9 +49,9 @@ def _unit(rng: np.random.Generator, size: int) -> Array:
     return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
 
 
-def _point(rng: np.random.Generator, p: AdaptiveSettings, share: float = 1.0) -> Point:
-    """A moving state. Of a whole share of k_θ, every other θ̂ lies where the projection acts, up to k_θ/0.95."""
-    bound = share * p.damping_bound
+def _point(rng: np.random.Generator, p: AdaptiveSettings) -> Point:
+    """A moving state; every other θ̂ lies where the projection acts, up to k_θ/0.95."""
+    bound = p.damping_bound
     length = rng.uniform(1.0, 1 / 0.95) if rng.uniform() < 0.5 else rng.uniform()
     return Point(
         q=_unit(rng, 4),
@@ -236,19 +235,6 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
         # scaling to a length of k_θ/0.95 rounds in the last place
         assert np.linalg.norm(theta - first) <= p.damping_bound / 0.95 * (1 + 1e-14)
     assert pressed > 300
-
-
-@pytest.mark.parametrize(
-    "allocation",
-    [
-        ((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, 0.0011, 0.0011)),  # two motors that do the same
-        ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.0014, 0.00176)),  # an axis that no motor acts on
-    ],
-)
-def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float, float, float], ...]) -> None:
-    settings = AdaptiveSettings.model_validate({"allocation": allocation})
-    with pytest.raises(LawError, match=r"law\.allocation \(B\) has no inverse"):
-        law_function(Adaptive(settings, 0.002, 3))
 
 
 def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:
