@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
@@ -134,13 +133,6 @@ class Hanging(FourthTick):
     def fail(self) -> None:
         while True:
             pass
-
-
-class Slow(FourthTick):
-    """Takes 0.3 s."""
-
-    def fail(self) -> None:
-        time.sleep(0.3)
 
 
 class NoLaw:

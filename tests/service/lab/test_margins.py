@@ -8,7 +8,7 @@ import pytest
 
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.config import load
-from aeroloop.service.lab.margins import WITHIN_DEG, Late, largest_error_deg, last_good, survived
+from aeroloop.service.lab.margins import WITHIN_DEG, Late, largest_error_deg, survived
 from tests.support.failing_laws import FAILING
 
 SLOW = load(overrides=["loop.rate_hz=100", "law.kind=pd"])
@@ -28,20 +28,6 @@ def test_what_a_law_survives_is_the_last_step_before_the_bound() -> None:
 def test_a_law_that_runs_away_survives_nothing() -> None:
     runaway = load(overrides=["loop.rate_hz=100", f"law.kind={FAILING}:Runaway"])
     assert survived(runaway, S) == {"delay_ms": None, "lost_frames": None}
-
-
-def test_short_experiments_have_short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    lengths = list[float]()
-
-    def run(_settings: object, duration_s: float, plant: object) -> None:
-        assert plant is not None
-        lengths.append(duration_s)
-        raise ValueError
-
-    monkeypatch.setattr("aeroloop.service.lab.margins.run_experiment", run)
-    survived(SLOW, 2.0)
-    survived(SLOW, 50.0)
-    assert set(lengths) == {2.0, 10.0}
 
 
 class Recording(EmulatedPlant):
@@ -74,9 +60,3 @@ def test_a_command_acts_late_or_until_the_next_that_is_not_lost(delay: int, lost
         plant.actuate([float(k)] * 3)
         plant.advance()
     assert body.periods == in_force
-
-
-@pytest.mark.parametrize("first", [0, 1, 2, 9, 10, 11, 37, 80, 81, 1000])
-def test_the_search_finds_the_last_number_before_the_first_that_fails(first: int) -> None:
-    last = last_good(lambda ticks: ticks < first, guess=10, most=100)
-    assert last == (None if first == 0 else first - 1 if first <= 80 else 100)
