@@ -1,4 +1,4 @@
-"""Kinds of quantizers through the whole loop: experiment, log, replay and certificate."""
+"""Kinds of quantizers through the whole loop: log, replay and certificate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyarrow.parquet
 import pytest
 
 from aeroloop.protocol.wire.spec import Kind
-from aeroloop.service.config import Settings, load_over, with_bits
+from aeroloop.service.config import Settings, load_over
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import Recording
@@ -36,21 +36,6 @@ def throughout(kind: str, *more: str) -> Settings:
 def replayed(path: Path) -> SessionReplay:
     (session,) = replay([path]).sessions
     return session
-
-
-# ── the loop ──
-
-
-@other_kinds
-def test_more_bits_bring_every_kind_to_the_loop_without_quantization(kind: str) -> None:
-    fine = run_experiment(with_bits(throughout(kind), "16/16"), 5.0)
-    continuous = run_experiment(with_bits(throughout(kind), "cont/cont"), 5.0)
-    # 16 bits err by 3e-5 at the most, against an ε̃ of 1e-2: a few parts in a thousand.
-    assert fine.z_track == pytest.approx(continuous.z_track, rel=5e-3)
-    assert fine.u_total == pytest.approx(continuous.u_total, rel=5e-3)
-
-
-# ── the log ──
 
 
 @other_kinds
@@ -95,9 +80,6 @@ def test_review_and_export_have_the_levels_that_were_sent_and_which_saturated(ki
     seen = [wire.measurement.unpack(frame.tobytes()) for frame in rows["measurement"]]
     level = wire.rate.quantizer().level
     assert table["rate_z_rad_s"] == [level(frame[1][5]) for frame in seen if frame is not None]
-
-
-# ── the certificate ──
 
 
 @every_kind
