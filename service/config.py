@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
+from pydantic_settings import SettingsConfigDict
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
@@ -21,7 +22,7 @@ from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
 from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
-from aeroloop.service.config_sources import Target, merge, sources, tree_of
+from aeroloop.service.config_sources import Sources, Target, merged, read, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import CustomLawSettings, LawSection, law_settings
@@ -138,10 +139,12 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
     Raises:
         ConfigError: The configuration is wrong.
     """
-    tree = Settings().description()
-    for given in sources(file, overrides, Settings):
-        merge(tree, given)
-    return _valid(tree)
+
+    class Configured(Settings, Sources):
+        model_config = SettingsConfigDict(toml_file=file)
+
+    found = read(Configured, overrides)
+    return Settings.model_construct(found.model_fields_set, **dict(found))
 
 
 def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
@@ -161,8 +164,10 @@ def from_description(config: dict[str, Any]) -> Settings:
     """The configuration in a role's description. Keys that this version does not have are left out.
 
     Raises:
-        ConfigError: This version cannot read it.
+        ConfigError: This version cannot read it, or a whole section is missing, as of what no role publishes.
     """
+    if missing := [name for name in Settings.model_fields if name not in config]:
+        raise ConfigError(f"a description without {', '.join(missing)}")
     settings = _valid(config, extra="ignore")
     if isinstance(settings.law, CustomLawSettings):  # keys of a user's law, which are not ours to know
         return settings.model_copy(update={"law": CustomLawSettings.model_validate(config["law"])})
@@ -178,9 +183,7 @@ def _valid(tree: dict[str, Any], extra: Literal["forbid", "ignore"] | None = Non
 
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
-    tree = settings.description()
-    merge(tree, tree_of(overrides))
-    return _valid(tree)
+    return _valid(merged(settings.description(), tree_of(overrides)))
 
 
 def with_bits(settings: Settings, text: str | None) -> Settings:

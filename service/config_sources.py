@@ -1,4 +1,4 @@
-"""Sources of the configuration: a TOML file, the environment and `--set`, each as a tree of sections and keys.
+"""Sources of the configuration, by pydantic-settings: `--set`, the environment and a TOML file, the stronger first.
 
 `Target` is all that a command of `aeroloop op` reads of them.
 """
@@ -7,11 +7,18 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Self, TypeVar
 
-from pydantic import BaseModel, Field, StringConstraints, ValidationError, create_model, model_validator
+from pydantic import BaseModel, Field, StringConstraints, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
@@ -24,11 +31,11 @@ ENV_PREFIX: Final = "AEROLOOP_"
 BODY: Final = ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
 """The model of the plant in `[law]`, which all laws have."""
 
-UNREAD: Final = ("loop", "wire", "reference", "law", "controller", "plant", "can", "recorder")
-"""Sections that a `Target` does not read."""
-
 _FREE: Final = ("can.options.", "plant.own.", "law.")
 """Sections in which any key may be given: a user's, or another library's."""
+
+_KINDS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {"reference": ("sinusoid", ()), "law": ("adaptive", BODY)}
+"""Sections of several kinds: the kind where none is named, and keys that all kinds have."""
 
 
 class ConfigError(AeroloopError):
@@ -55,24 +62,75 @@ class Target(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         return self
 
 
-def sources(
-    file: Path | None, overrides: Sequence[str], model: type[BaseModel], unread: Collection[str] = ()
-) -> Iterator[dict[str, Any]]:
-    """What is configured, as a tree for each source; a later one replaces values of an earlier one.
+class Sources(BaseSettings):
+    """Base of a model that is filled from the sources; `toml_file` of its `model_config` is the file, if any."""
 
-    Args:
-        file: A TOML file, or None.
-        overrides: `section.key=value`, values as TOML writes them (quotes may be left out).
-        model: Has the keys that the environment may give.
-        unread: Sections of which the environment's variables are not read.
+    model_config = SettingsConfigDict(
+        env_prefix=ENV_PREFIX,
+        env_nested_delimiter="__",
+        case_sensitive=True,  # `_variables` writes every key as its model does
+        enable_decoding=False,  # values are TOML, as with `--set`, and not JSON
+        nested_model_default_partial_update=True,
+    )
 
-    Raises:
-        ConfigError: A source cannot be read, or the environment gives a key that the model does not have.
-    """
-    if file is not None:
-        yield _read(file)
-    yield tree_of(_environment(model, unread))
-    yield tree_of(overrides)
+    @classmethod
+    def settings_customise_sources(
+        cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource, *_: Any, **__: Any
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """`--set` before the environment before the file."""
+        return init_settings, _Environment(settings_cls), _File(settings_cls)
+
+
+class _Environment(EnvSettingsSource):
+    def __init__(self, settings_cls: type[BaseSettings]) -> None:
+        super().__init__(settings_cls)
+        self.env_vars = _variables(settings_cls)
+
+    def __call__(self) -> dict[str, Any]:
+        return merged(_values(super().__call__()), self.current_state)
+
+
+class _File(TomlConfigSettingsSource):
+    def __call__(self) -> dict[str, Any]:
+        tree = super().__call__()
+        reference = tree.get("reference")
+        if isinstance(reference, dict) and isinstance(reference.get("path"), str):
+            reference["path"] = str(Path(str(self.toml_file_path)).parent / reference["path"])
+        return merged(tree, self.current_state)
+
+
+def _variables(model: type[BaseModel]) -> dict[str, str | None]:
+    """Variables of the environment that are keys, each written as the model writes it. Raises ConfigError."""
+    known = {key.upper(): key for key in keys(model)}
+    unread = tuple(f"{name}." for name, field in model.model_fields.items() if field.annotation is Any)
+    found: dict[str, str | None] = {}
+    for name, text in os.environ.items():
+        if not name.upper().startswith(ENV_PREFIX):
+            continue
+        key = name[len(ENV_PREFIX) :].replace("__", ".")
+        if key.upper() in known:
+            key = known[key.upper()]
+        elif key.lower().startswith((*_FREE, *unread)):
+            key = key.lower() if key.isupper() else key
+        else:
+            near = closest(key, known.values())
+            variable = ENV_PREFIX + (near or "").upper().replace(".", "__")
+            hint = f"did you mean {variable}?" if near else "unset it, or see `aeroloop show config`"
+            raise ConfigError(f"{name} in the environment is no setting: {hint}")
+        found[ENV_PREFIX + key.replace(".", "__")] = text
+    return found
+
+
+def _values(tree: dict[str, Any]) -> dict[str, Any]:
+    return {name: _values(each) if isinstance(each, dict) else value_of(each) for name, each in tree.items()}
+
+
+def value_of(text: str) -> Any:
+    """A value as TOML writes it; quotes of a string may be left out."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
@@ -82,90 +140,63 @@ def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
         key, equals, text = override.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set takes section.key=value, not {override!r}")
-        _put(tree, key.strip(), _value(text.strip()))
+        value = value_of(text.strip())
+        for name in reversed(key.strip().split(".")):
+            value = {name: value}
+        tree = merged(tree, value)
     return tree
 
 
-def merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
-    """Put the values of one tree into another. A reference or a law of another kind replaces the one that is there."""
-    for name, value in changes.items():
-        present: Any = tree.get(name)
-        if not (isinstance(value, dict) and isinstance(present, dict)):
-            tree[name] = value
-        elif name in ("reference", "law") and value.get("kind", present.get("kind")) != present.get("kind"):
-            kept = BODY if name == "law" else ()  # another kind has other keys; all laws have the body
-            tree[name] = {key: present[key] for key in kept if key in present} | value
-        else:
-            merge(present, value)
+def merged(weaker: dict[str, Any], stronger: dict[str, Any]) -> dict[str, Any]:
+    """Two trees as one. A law or a reference of another kind replaces the weaker one; a law keeps the body."""
+    tree = weaker | stronger
+    for name in weaker.keys() & stronger.keys():
+        old, new = weaker[name], stronger[name]
+        if isinstance(old, dict) and isinstance(new, dict):
+            default, kept = _KINDS.get(name, (None, ()))
+            if default and new.get("kind", default) != old.get("kind", default) and "kind" in new:
+                old = {key: old[key] for key in kept if key in old}
+            tree[name] = merged(old, new)
+    return tree
 
 
-def _read(file: Path) -> dict[str, Any]:
+SourcesT = TypeVar("SourcesT", bound=Sources)
+
+
+def read(model: type[SourcesT], overrides: Iterable[str]) -> SourcesT:
+    """A model filled from its sources. Raises ConfigError."""
+    file = model.model_config.get("toml_file")
+    if isinstance(file, Path) and not file.is_file():
+        raise ConfigError(f"no configuration file at {file}")
     try:
-        tree = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"no configuration file at {file}") from None
+        return model(**tree_of(overrides))
+    except ValidationError as error:
+        raise ConfigError("; ".join(problems(error, model))) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{file} is not TOML: {error}") from None
-    reference = tree.get("reference")
-    if isinstance(reference, dict) and isinstance(reference.get("path"), str):
-        reference["path"] = str(file.parent / reference["path"])
-    return tree
 
 
-def _environment(model: type[BaseModel], unread: Collection[str]) -> Iterator[str]:
-    """Variables of the environment as overrides, without those of the sections that are not read."""
-    given = {name: text for name, text in os.environ.items() if name.upper().startswith(ENV_PREFIX)}
-    known = {key.upper(): key for key in keys(model)} if given else {}
-    for name, text in sorted(given.items()):
-        key = name[len(ENV_PREFIX) :].replace("__", ".")
-        if key.lower().partition(".")[0] in unread:
-            continue
-        if key.upper() in known:
-            key = known[key.upper()]
-        elif free := next((section for section in _FREE if key.lower().startswith(section)), None):
-            rest = key[len(free) :]
-            key = free + (rest.lower() if rest.isupper() else rest)  # as written if in mixed case
-        else:
-            found = closest(key, known.values())
-            variable = ENV_PREFIX + (found or "").upper().replace(".", "__")
-            hint = f"did you mean {variable}?" if found else "unset it, or see `aeroloop show config`"
-            raise ConfigError(f"{name} in the environment is no setting: {hint}")
-        yield f"{key}={text}"
-
-
-def _put(tree: dict[str, Any], key: str, value: Any) -> None:
-    *sections, name = key.split(".")
-    for section in sections:
-        tree = tree.setdefault(section, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{section} is given a value, and then {key}: set its keys one by one")
-    tree[name] = value
-
-
-def _value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def load_target(file: Path | None = None, overrides: Sequence[str] = ()) -> Target:
+def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Target:
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
-    Why nothing else is read: `aeroloop op` starts sooner, and a mistake in another section does not keep it from
-    stopping a plant. Names of sections are checked all the same: what stands in `[netwrok]` would otherwise be missed.
+    Nothing else is read: a mistake in another section does not keep `op stop` from a plant. Names of sections are
+    checked all the same: what stands in `[netwrok]` would otherwise be missed.
 
     Raises:
         ConfigError: A source cannot be read, a section is unknown, or vehicle or network is wrong.
     """
-    tree: dict[str, Any] = {}
-    for given in sources(file, overrides, Target, UNREAD):
-        merge(tree, {name: value for name, value in given.items() if name not in UNREAD})
-    try:
-        return Target.model_validate(tree)
-    except ValidationError as error:
-        others: dict[str, Any] = dict.fromkeys(UNREAD, (Any, None))
-        sections = create_model("Sections", __base__=Target, **others)
-        raise ConfigError("; ".join(problems(error, sections))) from None
+
+    class Configured(Target, Sources):
+        model_config = SettingsConfigDict(toml_file=file)
+        loop: Any = None
+        wire: Any = None
+        reference: Any = None
+        law: Any = None
+        controller: Any = None
+        plant: Any = None
+        can: Any = None
+        recorder: Any = None
+
+    return read(Configured, overrides)

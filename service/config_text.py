@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterator
 from textwrap import wrap
 from typing import Any, Final
 
+import tomlkit
 from pydantic import BaseModel
+from tomlkit.items import Table
 
 WIDTH: Final = 100
 """Columns of a comment and of a list in one line."""
@@ -23,30 +23,32 @@ def toml(tree: dict[str, Any], settings: BaseModel | None = None) -> str:
         tree: The description of the settings.
         settings: What it describes: then a comment gives each key's description with its unit, and its bounds.
     """
-    return "\n".join(_section(tree, "", settings, {})).strip() + "\n"
+    document = tomlkit.document()
+    _fill(document, tree, settings, {})
+    return tomlkit.dumps(document).strip() + "\n"
 
 
-def _section(tree: dict[str, Any], path: str, settings: object, node: dict[str, Any]) -> Iterator[str]:
-    """Lines of a section; `settings` is its model's instance, `node` describes it in the JSON schema of its parent."""
+def _fill(table: tomlkit.TOMLDocument | Table, tree: dict[str, Any], settings: object, node: dict[str, Any]) -> None:
+    """Put a section into a table; `settings` is its model, `node` describes it in the JSON schema of its parent."""
     nodes = type(settings).model_json_schema()["properties"] if isinstance(settings, BaseModel) else {}
-    if path:
-        yield ""
-        yield from _comment(node.get("description", ""))
-        yield f"[{path}]"
     for name, value in tree.items():
         if isinstance(value, dict):
             continue
         kinds = node.get("discriminator", {}).get("mapping", ()) if name == "kind" else ()
         bounds = expected({"enum": list(kinds)} if kinds else nodes.get(name, {}))
-        yield from _comment(nodes.get(name, {}).get("description", "") + (f" ({bounds})" if bounds else ""))
+        _comment(table, nodes.get(name, {}).get("description", "") + (f" ({bounds})" if bounds else ""))
         if value is not None or name == "bits":
-            yield f"{_key(name)} = {_value('cont' if value is None else value)}"  # TOML has no null
+            table.add(name, _item("cont" if value is None else value))  # TOML has no null
         elif nodes:
-            yield f"# {name} = (not set)"
+            table.add(tomlkit.comment(f"{name} = (not set)"))
     for name, value in tree.items():
         if isinstance(value, dict):
-            inner = f"{path}.{_key(name)}".removeprefix(".")
-            yield from _section(value, inner, getattr(settings, name, None), nodes.get(name, {}))
+            inner = tomlkit.table()
+            if description := nodes.get(name, {}).get("description"):
+                _comment(inner, description)
+                inner.add(tomlkit.nl())
+            _fill(inner, value, getattr(settings, name, None), nodes.get(name, {}))
+            table.add(name, inner)
 
 
 def expected(node: dict[str, Any]) -> str:
@@ -71,21 +73,11 @@ def expected(node: dict[str, Any]) -> str:
     return ""
 
 
-def _comment(text: str) -> list[str]:
-    return wrap(" ".join(text.split()), WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+def _comment(table: tomlkit.TOMLDocument | Table, text: str) -> None:
+    for line in wrap(" ".join(text.split()), WIDTH - 2, break_on_hyphens=False):
+        table.add(tomlkit.comment(line))
 
 
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        items = [_value(item) for item in value]
-        line = f"[{', '.join(items)}]"
-        return line if len(line) <= WIDTH else "[\n    " + ",\n    ".join(items) + ",\n]"
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{_key(name)} = {_value(item)}' for name, item in value.items())} }}"
-    if isinstance(value, float):
-        return repr(value)
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _item(value: Any) -> Any:
+    item = tomlkit.item(value)
+    return item.multiline(multiline=True) if isinstance(value, list) and len(item.as_string()) > WIDTH else item

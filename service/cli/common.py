@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -21,8 +18,6 @@ if TYPE_CHECKING:
     from aeroloop.service.config_sources import Target
     from aeroloop.service.terminal.show import Sheets
 
-log: Final = logging.getLogger("aeroloop")
-
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
 PAPER_DURATION_S: Final = 50.0
@@ -30,8 +25,6 @@ PAPER_DURATION_S: Final = 50.0
 Result = TypeVar("Result", bound="BaseModel")
 
 state = {"debug": False}
-logged_as: list[str] = []
-"""The role of a daemon that logs JSON, so that its last error is a line of JSON, too; empty in other commands."""
 
 Config = Annotated[Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.")]
 Overrides = Annotated[
@@ -87,11 +80,8 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def report(message: str) -> None:
-    """Print an error as one line on stderr, or log it where a daemon logs JSON."""
-    if logged_as:
-        log.critical(message, extra={"event": "failed", "role": logged_as[0]})
-    else:
-        typer.echo(f"aeroloop: {message}", err=True)
+    """Print an error as one line on stderr."""
+    typer.echo(f"aeroloop: {message}", err=True)
 
 
 def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
@@ -127,24 +117,6 @@ def with_bits_of(settings: Settings, bits: str | None) -> Settings:
 
 
 @contextmanager
-def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code; ^C is a KeyboardInterrupt."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as in a background job
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    except (AeroloopError, ValueError) as error:
-        if state["debug"]:
-            raise
-        fail(str(error).splitlines()[0], 1)
-    except KeyboardInterrupt:
-        raise typer.Exit(INTERRUPTED) from None
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
 def checked(*models: type[BaseModel]) -> Iterator[None]:
     """Build values of these models from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
@@ -161,10 +133,10 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 
 @contextmanager
 def working(title: str, json: bool, total: float | None = None) -> Iterator[Callable[..., None]]:
-    """As `guarded`, with a progress bar: `update(done, total)`. No bar where JSON is printed."""
+    """A progress bar: `update(done, total)`. No bar where JSON is printed."""
     from aeroloop.service.terminal.display import progress_bar
 
-    with guarded(), progress_bar(title, total, hidden=json) as update:
+    with progress_bar(title, total, hidden=json) as update:
         yield update
 
 
@@ -193,5 +165,5 @@ def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
     """A path to write to, once the table is printed: a full disk must not cost the table."""
     from aeroloop.service.logs.outputs import writing
 
-    with guarded(), writing(path, [config], force=force) as part:
+    with writing(path, [config], force=force) as part:
         yield part

@@ -1,8 +1,7 @@
-"""First code of the command `aeroloop`: takes ^C over before anything slow is imported.
+"""First code of the command `aeroloop`: ^C, and SIGTERM of a daemon, end it without a traceback at any moment.
 
-Until a verb's work begins, and after it ends, ^C ends the process at once, without a traceback. While it works, ^C is a
-KeyboardInterrupt, which cleans up (`common.guarded`). Daemons and live views install handlers of their own; SIGTERM
-before that ends a daemon at once, with a line.
+^C is a KeyboardInterrupt, which cleans up. A daemon installs handlers of its own once it has its settings; SIGTERM
+before that ends it at once, with a line.
 """
 
 from __future__ import annotations
@@ -15,15 +14,8 @@ import sys
 INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
 
-DAEMONS = {"controller": "controller", "plant": "plant", "can-node": "node", "router": "router", "recorder": "recorder"}
-"""Verbs that run until SIGTERM, with exit code 0, and the role that each logs as."""
-
-
-def end_at_once(*_: object) -> None:
-    """Signal handler: end this process without clean-up, and show the cursor, which a progress bar hides."""
-    if os.isatty(2):
-        os.write(2, b"\x1b[?25h\n")
-    os._exit(INTERRUPTED)
+DAEMONS = ("controller", "plant", "can-node", "router", "recorder")
+"""Verbs that run until SIGTERM, with exit code 0."""
 
 
 def end_unstarted(*_: object) -> None:
@@ -34,16 +26,15 @@ def end_unstarted(*_: object) -> None:
 
 def main() -> None:
     """Entry point of the command."""
-    verb = next((word for word in sys.argv[1:] if not word.startswith("--") and word not in ("text", "json")), "")
-    if verb in DAEMONS:
-        signal.signal(signal.SIGTERM, end_unstarted)
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in a background job
-        signal.signal(signal.SIGINT, end_at_once)
-    # No matrix here is worth a thread on each core; for plug-ins pydantic would read every package's metadata.
-    for switch, value in (("OPENBLAS_NUM_THREADS", "1"), ("PYDANTIC_DISABLE_PLUGINS", "__all__")):
-        os.environ.setdefault(switch, value)
-    from aeroloop.service.cli.main import execute
+    try:
+        if next((word for word in sys.argv[1:] if not word.startswith("--")), "") in DAEMONS:
+            signal.signal(signal.SIGTERM, end_unstarted)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # no matrix here is worth a thread on each core
+        from aeroloop.service.cli.main import execute
 
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # of what the terminal's encoding lacks; stderr escapes it
-    sys.exit(execute(sys.argv[1:]))
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")  # of what the terminal's encoding lacks; stderr escapes it
+        code = execute(sys.argv[1:])
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    sys.exit(code)

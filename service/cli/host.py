@@ -11,23 +11,13 @@ from aeroloop.service.cli.common import (
     Config,
     Json,
     Overrides,
-    checked,
-    guarded,
     settings_of,
     show,
-    target_of,
     working,
 )
 
-DEFAULT_KEYS: Final = Path("~/.config/aeroloop/keys")
-"""Directory where none is configured."""
-
-Directory = Annotated[
-    Path | None,
-    typer.Option(
-        "--directory", help="Folder; network.security.directory if configured, else ~/.config/aeroloop/keys.",
-    ),
-]  # fmt: skip
+Directory = Annotated[Path, typer.Option("--directory", help="Folder of this host's keys.")]
+DIRECTORY: Final = Path("~/.config/aeroloop/keys")
 
 group = typer.Typer()
 keys = typer.Typer()
@@ -38,9 +28,7 @@ group.add_typer(
 
 @group.command()
 def doctor(
-    network: Annotated[
-        bool, typer.Option("--network", help="Try this host's certificates at every endpoint, too.")
-    ] = False,
+    network: Annotated[bool, typer.Option("--network", help="Shake hands with each configured place, too.")] = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -61,7 +49,6 @@ def doctor(
 @group.command()
 def units(
     install: Annotated[Path | None, typer.Option("--install", help="Write the units into this folder instead.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace units that exist.")] = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -77,27 +64,20 @@ def units(
         for name in units.units_of(source.settings):
             typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
     else:
-        with guarded():
-            for path in units.install(install, source, force=force):
-                typer.echo(path)
+        for path in units.install(install, source):
+            typer.echo(path)
     typer.echo("# next:")
     for step in units.next_steps(install, source):
         typer.echo(f"#   {step}" if install is None else step)
 
 
 @keys.command()
-def init(
-    days: Annotated[int, typer.Option(min=1, max=36500, help="How long the authority is valid, in days.")] = 3650,
-    directory: Directory = None,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
+def init(directory: Directory = DIRECTORY) -> None:
     """Make an authority that signs this network's certificates. Its key, ca.key, stays in the folder."""
-    folder = _folder(directory, config, overrides)
     from aeroloop.service.host import keys
 
-    with guarded():
-        typer.echo(keys.init(folder, days))
+    folder = directory.expanduser().absolute()
+    typer.echo(keys.init(folder))
     typer.echo(
         f"next: `aeroloop host keys issue ROLE NAME`, and in every configuration [network.security] directory = "
         f'"{folder}"',
@@ -112,29 +92,21 @@ def issue(
     vehicle: Annotated[
         str | None, typer.Option(help="Its vehicle, which plant and controller need; every vehicle if none.")
     ] = None,
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificate is valid, in days.")] = 90,
-    directory: Directory = None,
-    config: Config = None,
-    overrides: Overrides = None,
+    directory: Directory = DIRECTORY,
 ) -> None:
-    """Issue a certificate with a new key. 90 days, because none can be revoked: a stolen key is good until then."""
-    folder = _folder(directory, config, overrides)
+    """Issue a certificate with a new key, for 90 days."""
     from aeroloop.service.host import keys
 
-    with guarded():
-        typer.echo(keys.issue(folder, role, name, vehicle, days))
+    typer.echo(keys.issue(directory.expanduser().absolute(), role, name, vehicle))
 
 
 @keys.command("show")
-def show_keys(
-    json: Json = False, directory: Directory = None, config: Config = None, overrides: Overrides = None
-) -> None:
+def show_keys(json: Json = False, directory: Directory = DIRECTORY) -> None:
     """Print this host's certificates and their authority. Exits with 1 if one cannot be used."""
-    folder = _folder(directory, config, overrides)
     from aeroloop.service.host import keys
 
-    with guarded():
-        files = keys.show(folder)
+    folder = directory.expanduser().absolute()
+    files = keys.show(folder)
     if json:
         from json import dumps
 
@@ -146,11 +118,3 @@ def show_keys(
         show_all(key_sheets(str(folder), files), keys=2)
     if any(file.problem for file in files):
         raise typer.Exit(1)
-
-
-def _folder(given: Path | None, config: Path | None, overrides: list[str] | None) -> Path:
-    """The folder that is given, else the configured one, else the default."""
-    if given is None:
-        with checked():
-            given = target_of(config, overrides).network.security.folder or DEFAULT_KEYS
-    return given.expanduser().absolute()

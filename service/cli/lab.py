@@ -20,7 +20,6 @@ from aeroloop.service.cli.common import (
     Overrides,
     check_figure,
     checked,
-    guarded,
     loop_of,
     new_file,
     report,
@@ -100,8 +99,7 @@ def certify(
     from aeroloop.service.terminal.sheets import certificate_sheets
     from aeroloop.service.theorem import certificate
 
-    with guarded():
-        result = certificate.certify(settings, disturbance=disturbance)
+    result = certificate.certify(settings, disturbance=disturbance)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

@@ -17,7 +17,6 @@ from aeroloop.service.cli.common import (
     Require,
     checked,
     fail,
-    guarded,
     settings_of,
     show,
     working,
@@ -79,18 +78,17 @@ def review(
     from aeroloop.service.terminal.log_sheets import review_sheets
 
     _check_part(since_s, until_s)
-    with guarded():
-        with progress_bar("reading", 1, hidden=json) as update:
-            judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
-        if figures is not None:
-            from aeroloop.service.report.plots import draw_figures
+    with progress_bar("reading", 1, hidden=json) as update:
+        judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
+    if figures is not None:
+        from aeroloop.service.report.plots import draw_figures
 
-            with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(judged.report(), judged.settings, folder)
-            names = ", ".join(dict.fromkeys(path.stem for path in drawn))
-            typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
-        if html is not None:
-            write_html([judged.report(limits)], html, logs, force)
+        with writing_into(figures, logs, force=force) as folder:
+            drawn = draw_figures(judged.report(), judged.settings, folder)
+        names = ", ".join(dict.fromkeys(path.stem for path in drawn))
+        typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
+    if html is not None:
+        write_html([judged.report(limits)], html, logs, force)
     findings = judged.checked(limits)
     show(findings, json, review_sheets)
     if broken := broken_limits(findings):
@@ -118,11 +116,10 @@ def compare(
     from aeroloop.service.terminal.display import progress_bar
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 
-    with guarded():
-        with progress_bar("reading", 1, hidden=json) as update:
-            reports = read_runs(logs, limits, update)
-        if html is not None:
-            write_html(reports, html, logs, force)
+    with progress_bar("reading", 1, hidden=json) as update:
+        reports = read_runs(logs, limits, update)
+    if html is not None:
+        write_html(reports, html, logs, force)
     show(Comparison.of(reports), json, lambda _: comparison_sheets(reports))
     if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
@@ -138,8 +135,7 @@ def _check_page(out: Path | None, logs: Sequence[Path], force: bool) -> None:
     if out is not None:
         from aeroloop.service.logs.outputs import check_output
 
-        with guarded():
-            check_output(out, logs, force=force)
+        check_output(out, logs, force=force)
 
 
 def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:

@@ -7,37 +7,24 @@ configuration, 1 for a failed run, 130 for ^C.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import takewhile
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import typer
 from typer.exceptions import TyperException
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.cli import host, lab, log, op, run, show
-from aeroloop.service.cli.common import logged_as, report, state
-from aeroloop.service.cli.entry import DAEMONS, INTERRUPTED
-from aeroloop.service.cli.processes import log_as
-
-_GROUPS: Final = {
-    "lab": (lab.group, "Experiments, sweeps, tuning and certificates, in lockstep."),
-    "log": (log.group, "Review, compare, replay, recover and export logs."),
-    "op": (op.group, "Operate running roles over the network."),
-    "host": (host.group, "Check this machine, install its daemons, make its keys."),
-    "show": (show.group, "Print the configuration, the wire, a layout, examples."),
-}
+from aeroloop.service.cli.common import report, state
+from aeroloop.service.cli.entry import INTERRUPTED
 
 _EXTRAS: Final = {
-    "can": ("python-can", "can"),
-    "cantools": ("cantools", "can"),
-    "distributed": ("distributed", "dask"),
-    "foxglove": ("foxglove-sdk", "foxglove"),
-    "jinja2": ("Jinja2", "review"),
-    "matplotlib": ("matplotlib", "review"),
-    "plotly": ("plotly", "review"),
-    "pyarrow": ("pyarrow", "export"),
-    "scipy": ("scipy", "export"),
+    **dict.fromkeys(("can", "cantools"), "can"),
+    **dict.fromkeys(("jinja2", "matplotlib", "plotly"), "review"),
+    **dict.fromkeys(("pyarrow", "scipy"), "export"),
+    "distributed": "dask",
+    "foxglove": "foxglove",
 }
-"""Modules that the core installs without: the package, and the extra that brings it."""
+"""Modules that the core installs without, and the extra that brings each."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -46,14 +33,19 @@ app = typer.Typer(
     help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
 )
 app.add_typer(run.group)
-for _name, (_group, _help) in _GROUPS.items():
+for _name, _group, _help in (
+    ("lab", lab.group, "Experiments, sweeps, tuning and certificates, in lockstep."),
+    ("log", log.group, "Review, compare, replay, recover and export logs."),
+    ("op", op.group, "Operate running roles over the network."),
+    ("host", host.group, "Check this machine, install its daemons, make its keys."),
+    ("show", show.group, "Print the configuration, the wire, a layout, examples."),
+):
     app.add_typer(_group, name=_name, help=_help, no_args_is_help=True)
 
 
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code. Any error is one line on stderr."""
     state["debug"] = False
-    logged_as.clear()
     try:
         return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
@@ -61,37 +53,22 @@ def execute(arguments: Sequence[str]) -> int:
         if message.startswith("Usage: "):  # help, where no verb was given
             typer.echo(message, err=True)
         else:
-            words = takewhile(lambda word: not word.startswith("-"), arguments[:2])
-            command = context.command_path if context else " ".join(["aeroloop", *words])
-            typer.echo(f"aeroloop: {_words(message)} (see `{command} --help`)", err=True)
+            hint = f" (see `{context.command_path} --help`)" if context else ""
+            report(" ".join(message.split()).rstrip(".") + hint)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
     except Exception as error:
         if state["debug"]:
             raise
-        if isinstance(error, ModuleNotFoundError) and (missing := _EXTRAS.get((error.name or "").partition(".")[0])):
-            package, extra = missing
-            report(f"this needs {package}, which is not installed: pip install 'aeroloop[{extra}]'")
+        if isinstance(error, AeroloopError | ValueError):
+            report(str(error).splitlines()[0])
+        elif isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
+            report(f"this needs {error.name}, which is not installed: pip install 'aeroloop[{extra}]'")
         else:
             text = f"{type(error).__name__}: {error}".splitlines()[0]
             report(f"unexpected {text}; `aeroloop --debug …` shows where")
         return 1
-
-
-def _words(message: str) -> str:
-    """What is wrong with a command line, in one line; a verb without its group is found: `aeroloop op stop`."""
-    if message.startswith("No such command"):
-        verb = message.split("'")[1]
-        paths = [
-            f"`aeroloop {name} {verb}`"
-            for name, (group, _) in _GROUPS.items()
-            for each in group.registered_commands
-            if verb == (each.name or getattr(each.callback, "__name__", None))
-        ]
-        if paths:
-            return f"No such command '{verb}'; did you mean {' or '.join(paths)}?"
-    return " ".join(message.split()).rstrip(".")
 
 
 def _print_version(requested: bool) -> None:
@@ -107,15 +84,9 @@ def _print_version(requested: bool) -> None:
 
 @app.callback()
 def _options(
-    context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
-    log_format: Annotated[
-        Literal["text", "json"], typer.Option("--log-format", help="Format of a daemon's log lines on stderr.")
-    ] = "text",
     version: Annotated[  # noqa: ARG001  # its callback prints and ends
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
     ] = False,
 ) -> None:
     state["debug"] = debug
-    if role := DAEMONS.get(context.invoked_subcommand or ""):
-        log_as(role, as_json=log_format == "json")

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from shlex import join
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, target_of
+from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, target_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from aeroloop.protocol.messages.models import SessionRecord
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
     from aeroloop.service.config_sources import Target
 
@@ -52,10 +50,11 @@ def status(
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
-    with guarded():
-        found = gather(target.network)
-        if "vehicle" in target.model_fields_set:
-            found = found._replace(statuses={target.vehicle: found.statuses.get(target.vehicle, {})})
+    found = gather(target.network)
+    if "vehicle" in target.model_fields_set:
+        if target.vehicle not in found.statuses:
+            fail(f"no role of {target.vehicle} answers, only of {', '.join(sorted(found.statuses))}", 1)
+        found = found._replace(statuses={target.vehicle: found.statuses[target.vehicle]})
     well = not check or not troubles(found)
     if json:
         from json import dumps
@@ -80,64 +79,12 @@ def status(
 
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
-    """Show every vehicle and role on the network, live; q quits."""
+    """Show every vehicle and role on the network, live; ^C quits."""
     target = target_of(config, overrides)
     from aeroloop.service.terminal.monitor import watch
 
-    with guarded():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
-        watch(target.network)
-
-
-@group.command()
-def show(
-    last: Annotated[bool, typer.Option("--last", help="Of the last session, by the plant's record.")] = False,
-    json: Json = False,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
-    """Print gains and reference as the commands that set them."""
-    target = target_of(config, overrides)
-    from aeroloop.service.host.operator import show as record_of
-
-    with guarded():
-        record = record_of(target.network, _vehicle(target), last=last)
-    if json:
-        typer.echo(record.model_dump_json(indent=2))
-    else:
-        options = [*(["--config", str(config)] if config else []), *(w for o in overrides or () for w in ("--set", o))]
-        typer.echo("\n".join(as_commands(record, options)))
-
-
-def as_commands(record: SessionRecord, options: Sequence[str] = ()) -> list[str]:
-    """`op set-gains`, and `op goto` or `op track`, each with a comment that says where its values come from.
-
-    `options` are appended to each. Points stand in a here-document. A stream's time to reach a set-point has no option.
-    """
-    from aeroloop.protocol.messages.operator import Hold, Points, Sinusoid, Stream
-
-    def numbers(values: Sequence[float]) -> list[str]:
-        return [repr(float(value)).removesuffix(".0") for value in values]
-
-    gains = [word for name, value in record.gains.named.items() for word in (f"--{name}", *numbers(value))]
-    move, table = ["track", "hold"], ""
-    match record.reference:
-        case Hold(attitude=attitude) if attitude is not None:
-            move = ["goto", *numbers(attitude)]
-        case Sinusoid(amplitude=amplitude, frequency=frequency):
-            move = ["track", "sinusoid", "--amplitude", *numbers(amplitude), "--frequency", *numbers(frequency)]
-        case Stream(timeout_s=timeout_s):
-            move = ["track", "stream", "--timeout", *numbers([timeout_s])]
-        case Points(times=times, attitudes=attitudes):
-            move = ["track", "/dev/stdin"]
-            rows = (",".join(numbers([time, *attitude])) for time, attitude in zip(times, attitudes, strict=True))
-            table = "\n".join(["", *rows, "END"])
-    move += ["--in", *numbers([record.within_s])] if record.within_s else []
-    ended = f"; session {record.session} ended: {record.ended}" if record.ended else ""
-    return [
-        f"{join(['aeroloop', 'op', 'set-gains', *gains, *options])}  # {record.gains_from}{ended}",
-        f"{join(['aeroloop', 'op', *move, *options])}{' <<END' if table else ''}  # {record.reference_from}{table}",
-    ]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
+    watch(target.network)
 
 
 @group.command()
@@ -156,9 +103,8 @@ def stop(
     target = target_of(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
-    with guarded():
-        configured = "vehicle" in target.model_fields_set
-        answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
+    configured = "vehicle" in target.model_fields_set
+    answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
     for line in answers:
         typer.echo(line)
     if failures:
@@ -259,9 +205,6 @@ def track(
     frequency: Annotated[
         Three | None, typer.Option(help="sinusoid: of roll, pitch, yaw (rad/s); the paper's if left out.")
     ] = None,
-    timeout_s: Annotated[
-        float | None, typer.Option("--timeout", help="stream: hold after this long without a set-point, in s.")
-    ] = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -270,17 +213,20 @@ def track(
     from aeroloop.service.settings import read_points
 
     target = target_of(config, overrides)
-    given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
-    options = {name: value for name, value in given.items() if value is not None}
-    kinds: dict[str, type[Message]] = {"sinusoid": Sinusoid, "hold": Hold, "stream": Stream}
-    if options and what not in kinds:
+    options = {name: each for name, each in (("amplitude", amplitude), ("frequency", frequency)) if each is not None}
+    if options and what != "sinusoid":
         fail(f"{what} takes no option but --in", 2)
-    with checked(*kinds.values(), Track):
-        reference: Reference | None = None
-        if kind := kinds.get(what):
-            reference = cast("Reference", kind.model_validate(options))
-        elif what != "configured":
-            reference = read_points(Path(what))
+    with checked(Sinusoid, Track):
+        reference: Reference | None
+        match what:
+            case "sinusoid":
+                reference = Sinusoid.model_validate(options)
+            case "hold" | "stream":
+                reference = Hold() if what == "hold" else Stream()
+            case "configured":
+                reference = None
+            case _:
+                reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
     _send(target, "track", message)
 
@@ -289,8 +235,7 @@ def _send(target: Target, topic: str, message: Message | None = None) -> None:
     from aeroloop.protocol.messages.operator import Request
     from aeroloop.service.host.operator import send
 
-    with guarded():
-        typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
+    typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
 
 
 def _vehicle(target: Target) -> str:

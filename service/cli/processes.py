@@ -1,19 +1,13 @@
-"""Processes that run until a signal: their log lines, how they join the network, and how they end.
-
-A log line is plain text, or one JSON object for a log collector; the keys are in `service/host/README.md`, and stable.
-"""
+"""Processes that run until a signal: their log lines, how they join the network, and how they end."""
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
-import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from aeroloop.service.cli.common import guarded, log, logged_as
 from aeroloop.service.cli.entry import end_unstarted
 
 if TYPE_CHECKING:
@@ -21,35 +15,6 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
-
-_KEYS: Final = ("event", "role", "vehicle", "session", "tick")
-"""Keys of `log_event`'s records."""
-
-
-class JsonLines(logging.Formatter):
-    """A record as one line of JSON."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line."""
-        line = {
-            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            **{key: getattr(record, key, None) for key in _KEYS},
-            "message": record.getMessage(),
-        }
-        if record.exc_info:
-            line["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
-
-
-def log_as(role: str, *, as_json: bool) -> None:
-    """Log to stderr from `info` up, in text or in JSON; so is the error that ends the process."""
-    handler = logging.StreamHandler()
-    text = logging.Formatter("%(asctime)s %(levelname)s %(role)s: %(message)s", defaults={"role": "aeroloop"})
-    handler.setFormatter(JsonLines() if as_json else text)
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-    logged_as[:] = [role] if as_json else []
 
 
 def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None:
@@ -62,9 +27,9 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None
 
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)
     if (refused := no_linger()) is not None:
-        log.warning("%s", refused)
+        logging.getLogger("aeroloop").warning("%s", refused)
     name = controller_name() if kind == "controller" else None
-    with guarded(), Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
+    with Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
         begun.set()
         run(role)
 
@@ -73,18 +38,22 @@ def run_alone(run: Callable[[Event], None]) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
     begun, stop = _stop_on_signals()
     begun.set()
-    with guarded():
-        run(stop)
+    run(stop)
 
 
 def _stop_on_signals() -> tuple[Event, Event]:
-    """Events to set once the process has begun, and set by a signal to stop, which before that ends the process.
+    """Log to stderr, and return events: one to set once the process has begun, one that a signal to stop sets.
 
-    Why a thread waits for them: a handler would run in the main thread, where Zenoh may be waiting for a peer, and
-    which may hold the lock of the event that the handler sets: then the process would never end.
+    Before the process has begun, a signal ends it. Why a thread waits for signals: a handler would run in the main
+    thread, where Zenoh may be waiting for a peer, and which may hold the lock of the event that the handler sets: then
+    the process would never end.
     """
     from threading import Event, Thread
 
+    handler = logging.StreamHandler()
+    line = "%(asctime)s %(levelname)s %(role)s: %(message)s"
+    handler.setFormatter(logging.Formatter(line, defaults={"role": "aeroloop"}))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     begun, stop, signals = Event(), Event(), {signal.SIGTERM, signal.SIGINT}
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; else a closed terminal
         signals.add(signal.SIGHUP)

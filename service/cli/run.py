@@ -18,7 +18,6 @@ from aeroloop.service.cli.common import (
     Json,
     NewLog,
     Overrides,
-    fail,
     loop_of,
     settings_of,
     show,
@@ -32,15 +31,6 @@ if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.protocol.runtime.node import Node
-
-Faults = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--fault",
-        metavar="SIGNAL:KIND@T",
-        help="Fault to inject, such as rate:off@5 or command:drop=0.05; may be repeated.",
-    ),
-]
 
 group = typer.Typer()
 
@@ -100,24 +90,18 @@ def controller(
 
 
 @group.command()
-def plant(faults: Faults = None, config: Config = None, overrides: Overrides = None) -> None:
+def plant(config: Config = None, overrides: Overrides = None) -> None:
     """Run the plant end that `plant.via` names until SIGTERM. It is the emulator, a CAN bridge or Quanser's board."""
-    settings = settings_of(config, overrides, *_fault_options(faults))
-    if faults and settings.plant.via != "emulator":
-        fail(f"--fault is for the emulator, and plant.via is {settings.plant.via}", 2)
+    settings = settings_of(config, overrides)
+    from aeroloop.service.daemon.roles import run_plant
 
-    def run(role: Node) -> None:
-        from aeroloop.service.daemon.roles import run_plant
-
-        run_plant(role, settings)
-
-    run_role("plant", settings, run)
+    run_role("plant", settings, lambda role: run_plant(role, settings))
 
 
 @group.command("can-node")
-def can_node(faults: Faults = None, config: Config = None, overrides: Overrides = None) -> None:
+def can_node(config: Config = None, overrides: Overrides = None) -> None:
     """Run the emulated plant as a node on the CAN bus."""
-    settings = settings_of(config, overrides, *_fault_options(faults))
+    settings = settings_of(config, overrides)
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
@@ -128,10 +112,6 @@ def can_node(faults: Faults = None, config: Config = None, overrides: Overrides 
         driver.run(CanNetwork(settings.can, loop, driver.endpoint))
 
     run_alone(run)
-
-
-def _fault_options(faults: list[str] | None) -> list[str]:
-    return [f"plant.faults={dumps(faults)}"] if faults else []
 
 
 @group.command()
@@ -148,10 +128,6 @@ def recorder(log: NewLog = None, config: Config = None, overrides: Overrides = N
     """Record every vehicle on the network into a log until SIGTERM."""
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
     settings = settings_of(config, overrides, *words)
+    from aeroloop.service.recording.recorder import Recorder
 
-    def run(role: Node) -> None:
-        from aeroloop.service.recording.recorder import Recorder
-
-        Recorder(role, settings.recorder).run()
-
-    run_role("recorder", settings, run)
+    run_role("recorder", settings, lambda role: Recorder(role, settings.recorder).run())

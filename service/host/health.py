@@ -18,18 +18,7 @@ NEEDED: Final = ("controller", "plant")
 
 
 class Trouble(NamedTuple):
-    """Something that is wrong.
-
-    Attributes:
-        kind: tripped (a plant), faulted (a controller), not recording or lossy (a recorder), silent (no status for
-            `SILENT_S`, or a process that accepts connections and does not answer), late (more than `LATE_SHARE` of the
-            last 10 s' ticks skipped, or commands that take longer than a period at the 99th percentile), missing (a
-            controller or a plant of a vehicle that has another role; a recorder that was there or is required), not
-            kept (a stop or a trip of a plant, on its disk).
-        vehicle: Its name; None for a process that does not answer.
-        role: Its role, likewise.
-        text: One line.
-    """
+    """Something that is wrong, in one line; vehicle and role are None of a process that does not answer."""
 
     kind: Literal["tripped", "faulted", "not recording", "lossy", "silent", "late", "missing", "not kept"]
     vehicle: str | None

@@ -65,7 +65,7 @@ class KeyFile(BaseModel, frozen=True):
     problem: str | None = Field(default=None, description="why it cannot be used; null if it can")
 
 
-def init(directory: Path, days: int = AUTHORITY_DAYS) -> Path:
+def init(directory: Path) -> Path:
     """Make a private authority, `ca.pem` and `ca.key`, in a new or existing directory. Returns `ca.pem`.
 
     It has a name of its own: an authority that replaces another must not be taken for it.
@@ -80,33 +80,31 @@ def init(directory: Path, days: int = AUTHORITY_DAYS) -> Path:
     except OSError as error:
         raise CertificateError(f"cannot make {directory}: {error.strerror}") from None
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"aeroloop authority {uuid4().hex[:8]}")])
-    key, until = generate_private_key(SECP256R1()), datetime.now(UTC) + timedelta(days=days)
+    key, until = generate_private_key(SECP256R1()), datetime.now(UTC) + timedelta(days=AUTHORITY_DAYS)
     made = _signed(key, name, name, key.public_key(), until, authority=True)
     return _write_pair(directory / AUTHORITY, directory / KEY, made, key)
 
 
-def issue(directory: Path, role: str, name: str, vehicle: str | None = None, days: int = DAYS) -> Path:
-    """Make a key and its certificate for a role. Returns the certificate's file, `ROLE.VEHICLE.pem`.
+def issue(directory: Path, role: str, name: str, vehicle: str | None = None) -> Path:
+    """Make a key and its certificate for a role, for `DAYS`. Returns the certificate's file, `ROLE.VEHICLE.pem`.
 
     Args:
         directory: Where the authority's key is.
         role: One of `ROLES`.
         name: Host or person that gets it.
         vehicle: Its vehicle; None is every one.
-        days: How long it is valid; it ends with the authority's at the latest.
 
     Raises:
         CertificateError: Role, name or vehicle will not do; a file exists; the authority's key is not here.
     """
     subject, file = _subject(role, name, vehicle), file_of(directory, role, vehicle)
-    _refuse_existing(file, file.with_suffix(".key"))
     secret, authority = _read_key(directory / KEY), load(directory / AUTHORITY)
     if authority.public_key() != secret.public_key():
         raise CertificateError(f"{directory / KEY} is not the key of {AUTHORITY} beside it")
     now = datetime.now(UTC)
     if authority.not_valid_after_utc <= now:
         raise CertificateError(EXPIRED.format(directory / AUTHORITY))
-    key, until = generate_private_key(SECP256R1()), min(now + timedelta(days=days), authority.not_valid_after_utc)
+    key, until = generate_private_key(SECP256R1()), min(now + timedelta(days=DAYS), authority.not_valid_after_utc)
     made = _signed(secret, authority.subject, subject, key.public_key(), until)
     return _write_pair(file, file.with_suffix(".key"), made, key)
 
@@ -133,23 +131,26 @@ def show(directory: Path) -> list[KeyFile]:
 
 
 def _shown(file: Path) -> KeyFile:
-    row = KeyFile(file=file.name)
+    role, _, vehicle = file.stem.partition(".")
     try:
         found = read_certificate(file)
-        row = KeyFile(
-            file=file.name,
-            role=found.role,
-            vehicle=found.vehicle,
-            name=found.name,
-            valid_until=found.not_after,
-            days_left=found.days_left,
-            fingerprint=found.x509.fingerprint(SHA256()).hex(),
-        )
-        role, _, vehicle = file.stem.partition(".")
+    except CertificateError as error:
+        return KeyFile(file=file.name, problem=str(error))
+    problem = None
+    try:
         check(file, role, vehicle or None)
     except CertificateError as error:
-        return row.model_copy(update={"problem": str(error)})
-    return row
+        problem = str(error)
+    return KeyFile(
+        file=file.name,
+        role=found.role,
+        vehicle=found.vehicle,
+        name=found.name,
+        valid_until=found.not_after,
+        days_left=found.days_left,
+        fingerprint=found.x509.fingerprint(SHA256()).hex(),
+        problem=problem,
+    )
 
 
 def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
@@ -203,15 +204,11 @@ def _read_key(file: Path) -> EllipticCurvePrivateKey:
         raise CertificateError(f"{file} is no private key in PEM without a password") from None
 
 
-def _refuse_existing(*files: Path) -> None:
-    for file in files:
-        if os.path.lexists(file):
-            raise CertificateError(f"{file} exists, and is not overwritten: move it away first")
-
-
 def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticCurvePrivateKey) -> Path:
-    """Write a certificate and its key as new files: complete or absent, and of their mode from the first byte on."""
-    _refuse_existing(file, secret)
+    """Write a certificate and its key as new files, of their mode from the first byte on."""
+    for path in (file, secret):
+        if os.path.lexists(path):
+            raise CertificateError(f"{path} exists, and is not overwritten: move it away first")
     contents = {
         secret: (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600),
         file: (made.public_bytes(Encoding.PEM), 0o644),
@@ -219,13 +216,7 @@ def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticC
     for path, (content, mode) in contents.items():
         try:
             with open(path, "xb", opener=partial(os.open, mode=mode)) as out:
-                try:
-                    out.write(content)
-                    out.flush()
-                    os.fsync(out.fileno())
-                except OSError:
-                    path.unlink()
-                    raise
+                out.write(content)
         except OSError as error:
             raise CertificateError(f"cannot write {path}: {error.strerror}") from None
     return file

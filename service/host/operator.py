@@ -20,13 +20,13 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import SessionRecord, Status
+from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.host import listener
 from aeroloop.protocol.transport.certificate import refusal
 from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session
-from aeroloop.protocol.transport.network_settings import READER, Identity, NetworkSettings
+from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
 
 ANSWER_S: Final = 1.0
 
@@ -196,27 +196,6 @@ def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str
     found = [topics.read_key(str(token.ok.key_expr)) for token in tokens if token.ok is not None]
     controlled = {each.vehicle for each in found if each and each.role and each.role.startswith("controller")}
     return sorted(name for name in controlled if name not in answered)
-
-
-def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> SessionRecord:
-    """Gains and reference of a vehicle's controller: of several, the one with the session, if any.
-
-    With `last`, those of the last session that ended, by the plant's record.
-
-    Raises:
-        OperatorError: No controller answers, or the plant has no record.
-    """
-    found: list[SessionRecord] = []
-    with command_session(network, identity=READER._replace(vehicle=vehicle)) as here:
-        here.wait_for_links()
-        for reply in _get(here.session, topics.key("show", vehicle), Request().encode(), ANSWER_S):
-            with suppress(ValidationError):  # a plant without a record answers so
-                record = SessionRecord.model_validate_json(reply.ok.payload.to_bytes() if reply.ok else b"")
-                found += [record] if (record.ended is not None) == last else []
-    if not found:
-        which = f"no plant of {vehicle} with a record of a session" if last else f"no controller of {vehicle}"
-        raise OperatorError(_nobody(network, which))
-    return next((record for record in found if record.session), found[0])
 
 
 def _get(session: zenoh.Session, key: str, payload: bytes | None, timeout_s: float) -> Iterable[zenoh.Reply]:

@@ -32,7 +32,8 @@ _WITHOUT_DEVICE: Final = ("socketcan", "socketcand", "udp_multicast", "virtual")
 """python-can's interfaces that open no device file."""
 
 _TEMPLATE: Final = """\
-# For plant.via = "{via}", by `aeroloop host units`; make it again when that changes.
+# For plant.via = "{via}", by `aeroloop host units`; make it again when that changes. Your own changes go to
+# `systemctl edit`, which keeps them in another file.
 [Unit]
 Description=aeroloop: {what}
 After=network-online.target
@@ -93,7 +94,7 @@ def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
     # systemd starts a plant again by itself, so it is unarmed then; a --set of the user's own comes later and wins.
     unarmed = ["--set", "plant.armed_at_start=false"] if name == "plant" else []
-    words = [*_executable(), "--log-format", "json", name, *unarmed, *source.options]
+    words = [*_executable(), name, *unarmed, *source.options]
     rights = _user(source)
     if name == "plant":
         configured = source.settings.plant.state_directory
@@ -121,16 +122,9 @@ def unit(name: str, source: Source) -> str:
     )
 
 
-def install(folder: Path, source: Source, *, force: bool = False) -> list[Path]:
-    """Write every unit into a folder and return their paths.
-
-    Raises:
-        UnitError: A unit exists and `force` is false, or the folder cannot be written.
-    """
+def install(folder: Path, source: Source) -> list[Path]:
+    """Write every unit into a folder, over an older one, and return their paths. Raises UnitError if it cannot."""
     paths = {name: folder / f"aeroloop-{name}.service" for name in units_of(source.settings)}
-    existing = [str(path) for path in paths.values() if path.exists()]
-    if existing and not force:
-        raise UnitError(f"not written over without --force: {', '.join(existing)}")
     try:
         for name, path in paths.items():
             path.write_text(unit(name, source))
@@ -141,7 +135,10 @@ def install(folder: Path, source: Source, *, force: bool = False) -> list[Path]:
 
 def next_steps(folder: Path | None, source: Source) -> list[str]:
     """Commands that remain after `install` into a folder (None: the units were printed) until the daemons run."""
-    steps = []
+    hidden = [path for path in (Path(_executable()[0]), source.config.absolute()) if path.is_relative_to("/tmp")]  # noqa: S108
+    steps = [
+        f"# {path} is in /tmp, which units do not see (PrivateTmp=): move it, to /opt for example" for path in hidden
+    ]
     if not source.config.exists():
         steps.append(f"sudo mkdir -p {source.config.parent}")
         steps.append(f"aeroloop show config | sudo tee {source.config} >/dev/null")

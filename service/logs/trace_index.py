@@ -162,9 +162,11 @@ class TraceIndex:
             for entry in entries
             if _is_whole(entry.record)
         ]
-        if _is_whole([change for entry in entries for change in entry.changes if change.tick == 0]):
-            proven.append((0, 0))
         having = [entry for entry in self.parts[which, "controller"] if entry.header.rows]
+        begun = [change for entry in entries for change in entry.changes if change.tick == 0]
+        # A session whose first row is of a later tick has found no attitude to hold before.
+        if having and having[0].first == 0 and _is_whole(begun):
+            proven.append((0, 0))
         gaps = [i for i in range(1, len(having)) if having[i].header.first_row > having[i - 1].after]
         recorded, known = list[tuple[int, int]](), list[tuple[int, int]]()
         for i, j in pairwise([0, *gaps, len(having)]) if having else ():  # rows without a gap

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from math import log2
 from typing import TYPE_CHECKING, Final
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.report import rows
 from aeroloop.service.report.rows import count, grave, missing
-from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, Spread, differences
+from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, differences
 from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
@@ -28,7 +27,6 @@ DISAGREEMENTS_SHOWN: Final = 5
 SESSIONS_SHOWN: Final = 9
 DAMAGES_SHOWN: Final = 20
 UNSEEN_SHOWN: Final = 3
-_BARS: Final = "▁▂▃▄▅▆▇█"
 
 
 def figure_sheets(figures: Figures) -> Sheets:
@@ -61,7 +59,7 @@ def review_sheets(findings: Findings) -> Sheets:
     durations: list[Row] = []
     for each in rows.durations([findings]):
         percentiles = dict(zip(rows.PERCENTILES.values(), each.percentiles, strict=True))
-        durations.append({"": each.label, **percentiles, "spread": sparkline(each.spread) if each.spread else ""})
+        durations.append({"": each.label, **percentiles})
     if durations:
         yield "", durations
     yield "", [{"of the log": label, "found": text} for label, text in _details(findings)]
@@ -100,20 +98,6 @@ def comparison_sheets(reports: Sequence[Report]) -> Sheets:
         yield "\n".join(lines), []
 
 
-def sparkline(spread: Spread, width: int = 12) -> str:
-    """The distribution as a row of bars: logarithm of the count over logarithm of the duration.
-
-    Why logarithms: a single late tick in a million stays visible.
-    """
-    first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
-    counts = [0] * width
-    for edge, n in spread.bins:
-        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += n
-    top = log2(1 + max(counts))
-    bars = (_BARS[round(log2(1 + n) / top * (len(_BARS) - 1))] if n else " " for n in counts)
-    return "".join(bars).rstrip()
-
-
 def _one_run(run: Figures) -> list[Row]:
     found = [
         (figure, value)
@@ -143,9 +127,6 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
             yield f"invalid {name}s", str(n)
     if findings.lapses:
         yield "irregular ticks", ", ".join(f"{n} {name}" for name, n in findings.lapses.items())
-    if findings.clock_offset_us is not None:
-        first, last = findings.clock_offset_us
-        yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
     for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
@@ -161,11 +142,8 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "vehicles", f"{', '.join(vehicles)}; shown is {findings.vehicle}, --vehicle shows another"
     its = [one for one in findings.recorded if one.vehicle == findings.vehicle]
     if len(its) > 1:
-        for i, one in enumerate(its, 1):
-            shown = ", shown" if one.session == findings.session else ""
-            if shown or i <= SESSIONS_SHOWN:
-                yield "sessions" if i == 1 else "", f"{i}  {one.session}, {one.duration_s:.1f} s{shown}"
-        yield "", f"--session N shows another of {len(its)}"
+        listed = [f"{i} is {one.session}, {one.duration_s:.1f} s" for i, one in enumerate(its, 1)]
+        yield "sessions", f"{'; '.join(_some(listed, SESSIONS_SHOWN))}; --session N shows another"
 
 
 def _fault(fault: FaultInterval) -> Row:

@@ -6,19 +6,13 @@ left out, and what was not received for `SILENT_S` is marked with its age.
 
 from __future__ import annotations
 
-import os
-import select
-import sys
-import termios
 import threading
 import time
-import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import suppress
 from math import degrees
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from pydantic import ValidationError
@@ -27,6 +21,7 @@ from rich.live import Live
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.operator import Message
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle, to_euler
@@ -38,13 +33,10 @@ REFRESH_S: Final = 0.2
 EVENTS: Final = 5
 
 
-@dataclass
-class Vehicle:
-    """The latest messages of one vehicle, with the time of their arrival on the clock [s]."""
+Latest = dict[str, dict[tuple[str, str], tuple[float, Any]]]
+"""By vehicle, and by topic and role, the last message with the time of its arrival on the clock [s]."""
 
-    statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
-    telemetry: tuple[float, Telemetry] | None = None
-    truth: tuple[float, Truth] | None = None
+MODELS: Final[dict[str, type[Message]]] = {"status": Status, "telemetry": Telemetry, "truth": Truth, "event": Event}
 
 
 class Top:
@@ -53,71 +45,62 @@ class Top:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._vehicles: dict[str, Vehicle] = {}
+        self._latest: Latest = {}
         self._events: deque[str] = deque(maxlen=EVENTS)
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Take in a message of any topic; drops what it cannot parse."""
+        """Take in a message of any topic; drops what it cannot parse, as it is of another version."""
         address = topics.read_key(key)
-        if address is None:
+        if address is None or (model := MODELS.get(address.topic.name)) is None:
             return
-        with self._lock:
-            vehicle = self._vehicles.setdefault(address.vehicle, Vehicle())
-            try:
-                match address.topic.name:
-                    case "status" if address.role is not None:
-                        vehicle.statuses[address.role] = self._clock(), Status.model_validate_json(payload)
-                    case "telemetry":
-                        vehicle.telemetry = self._clock(), Telemetry.model_validate_json(payload)
-                    case "truth":
-                        vehicle.truth = self._clock(), Truth.model_validate_json(payload)
-                    case "event":
-                        event = Event.model_validate_json(payload)
-                        self._events.append(
-                            f"{time.strftime('%H:%M:%S')} {address.vehicle} {address.role}: {event.text}"
-                        )
-            except ValidationError:
-                pass  # of another version; its other messages may still parse
+        with self._lock, suppress(ValidationError):
+            latest = self._latest.setdefault(address.vehicle, {})
+            message = model.model_validate_json(payload)
+            latest[address.topic.name, address.role or ""] = self._clock(), message
+            if isinstance(message, Event):
+                self._events.append(f"{time.strftime('%H:%M:%S')} {address.vehicle} {address.role}: {message.text}")
 
     def draw(self, width: int) -> Group:
         """The current view, for a terminal of this width."""
         with self._lock:
             now, blocks = self._clock(), list[Group]()
-            for name, vehicle in sorted(self._vehicles.items()):
-                statuses = {role: (now - at, status) for role, (at, status) in vehicle.statuses.items()}
-                values = "   ".join(_values(vehicle, statuses, now))
+            for name, latest in sorted(self._latest.items()):
+                ages = {each: (now - at, message) for each, (at, message) in latest.items()}
+                statuses = {role: each for (topic, role), each in ages.items() if topic == "status"}
+                values = "   ".join(_values(ages, statuses))
                 blocks += [drawn(rows, title, width) for title, rows in (*role_sheets(statuses, name), (values, []))]
                 blocks.append(drawn([], " ", width))
             events = "\n".join(self._events) if blocks else "no role on the network yet"
             return Group(*blocks, drawn([], events, width))
 
 
-def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[str]:
+def _values(
+    ages: Mapping[tuple[str, str], tuple[float, Any]], statuses: Mapping[str, tuple[float, Any]]
+) -> Iterator[str]:
     """Attitude, error and voltages, as far as they are those of now."""
-    if vehicle.truth is not None:
-        at, truth = vehicle.truth
+    if ("truth", "") in ages:
+        age, truth = ages["truth", ""]
         roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
         text = f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°"
-        yield text if now - at < SILENT_S else f"no attitude for {duration(now - at)}"
-    at, telemetry = vehicle.telemetry or (now, None)
+        yield text if age < SILENT_S else f"no attitude for {duration(age)}"
     # The session that runs, by the plant, or by the controller where there is no plant.
     age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
     session = status.session if status is not None and age < SILENT_S else None
+    age, telemetry = ages.get(("telemetry", ""), (0.0, None))
     if session is None:
         if statuses:
             yield "no session: no error, no voltages"
-        return
-    if telemetry is None or telemetry.session != session:
+    elif telemetry is None or telemetry.session != session:
         yield "no telemetry yet"
-    elif now - at >= SILENT_S:
-        yield f"no telemetry for {duration(now - at)}"
+    elif age >= SILENT_S:
+        yield f"no telemetry for {duration(age)}"
     else:
         yield f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°"
         yield "voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V"
 
 
 def watch(network: NetworkSettings) -> None:
-    """Subscribe, and draw five times a second until `q` is pressed, or ^C.
+    """Subscribe, and draw five times a second until ^C.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -133,39 +116,12 @@ def watch(network: NetworkSettings) -> None:
 
     with (
         join(network, listen=False) as session,
-        keyboard() as wait_for_keys,
         Live(console=console, auto_refresh=False, screen=console.is_terminal) as live,
     ):
         session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
-        for name in ("status", "telemetry", "truth", "event"):
+        for name in MODELS:
             session.declare_subscriber(topics.key(name, "*"), receive)
-        live.update(top.draw(console.width), refresh=True)
-        while "q" not in wait_for_keys(REFRESH_S):
-            live.update(top.draw(console.width), refresh=True)
-
-
-@contextmanager
-def keyboard() -> Iterator[Callable[[float], str]]:
-    """A function that waits up to a time [s] for keys and returns them, `q` where the terminal is gone.
-
-    Where stdin is no terminal it only waits. The terminal's mode is restored at the end.
-    """
-    terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
-
-    def keys(wait_s: float) -> str:
-        if terminal is None:
-            time.sleep(wait_s)
-        elif select.select([terminal], [], [], wait_s)[0]:
-            pressed = os.read(terminal, 64).decode(errors="ignore") or "q"
-            return "" if pressed.startswith("\x1b") else pressed  # an arrow key, for example
-        return ""
-
-    if terminal is None:
-        yield keys
-        return
-    before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)
-    try:
-        yield keys
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        with suppress(KeyboardInterrupt):
+            while True:
+                live.update(top.draw(console.width), refresh=True)
+                time.sleep(REFRESH_S)

@@ -1,11 +1,8 @@
-"""Printer of results: rows of text as a table for a terminal, as Markdown, CSV or JSON."""
+"""Printer of results: rows of text as a table for a terminal of any width, or as Markdown."""
 
 from __future__ import annotations
 
-import csv
-import json
 import re
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, TypeAlias
 
@@ -16,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 Row: TypeAlias = dict[str, str]
-Format: TypeAlias = Literal["terminal", "markdown", "csv", "json"]
+Format: TypeAlias = Literal["terminal", "markdown"]
 
 Sheets: TypeAlias = Iterable[tuple[str, Sequence[Row]]]
 """Tables, each with its title, and paragraphs, which are titles without rows."""
@@ -37,16 +34,10 @@ def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: 
     Args:
         rows: From column to text.
         title: Above the table, in a terminal and in Markdown.
-        form: One of four.
+        form: For a person or for a document.
         keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
     """
-    if form == "json":
-        typer.echo(json.dumps(rows, ensure_ascii=False, indent=2))
-    elif form == "csv":
-        writer = csv.DictWriter(sys.stdout, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
-    elif form == "markdown":
+    if form == "markdown":
         typer.echo("\n".join(_markdown(rows, title)))
     else:
         console = Console()

@@ -87,7 +87,7 @@ def test_a_daemon_notifies_systemd_that_it_is_ready_that_it_lives_and_that_it_st
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(path))
         manager.settimeout(30)  # a process starts within about a second; CI may be busy
-        command = [*AEROLOOP, "--log-format", "json", "plant", "--set", f"network.rendezvous={free_rendezvous()}"]
+        command = [*AEROLOOP, "plant", "--set", f"network.rendezvous={free_rendezvous()}"]
         daemon = subprocess.Popen(
             command, env={**os.environ, "NOTIFY_SOCKET": str(path)}, stderr=subprocess.PIPE, text=True
         )
@@ -99,9 +99,5 @@ def test_a_daemon_notifies_systemd_that_it_is_ready_that_it_lives_and_that_it_st
     assert received[0] == "READY=1"
     assert set(received[1:-1]) == {"WATCHDOG=1"}
     assert daemon.returncode == 0
-    lines = [json.loads(line) for line in stderr.splitlines()]
-    assert [(line["message"], line["event"]) for line in lines] == [
-        ("aero waits for a claim", "started"),
-        ("aero stopped at 0 V", "stopped"),
-    ]
-    assert all((line["role"], line["vehicle"]) == ("plant", "aero") for line in lines)
+    lines = [line.partition(" plant: ")[2] for line in stderr.splitlines()]
+    assert lines == ["aero waits for a claim", "aero stopped at 0 V"]

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import getpass
-import shlex
 import signal
 from datetime import UTC, datetime
 from math import degrees
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from aeroloop.plant_emulator.hosts.latch_file import Latch
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Truth
-from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
+from aeroloop.protocol.messages.operator import Gains, Hold, Request, Sinusoid
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.service.config import load
-from aeroloop.service.host.operator import show
 from aeroloop.service.lab.demo import run_demo
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.testing.hil import Hil
-from tests.hil.test_operate import op
 from tests.support.processes import PATIENT
 
 TARGET = Hold(attitude=(0.0, -10.0, 30.0))
@@ -69,8 +69,18 @@ def test_yesterdays_stop_surprises_no_demo(tmp_path: Path) -> None:
 
 
 def shown(hil: Hil, *, last: bool = False) -> SessionRecord:
-    """What `op show` reads."""
-    return show(hil.settings.network, "aero", last=last)
+    """What the controller follows; with `last` the plant's record of the session that ended."""
+    with command_session(hil.settings.network) as here:
+        here.wait_for_links()
+        replies = here.session.get(
+            topics.key("show", "aero"),
+            payload=Request().encode(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    records = [SessionRecord.model_validate_json(each) for each in payloads if b'"controller"' in each]
+    return next(record for record in records if (record.ended is not None) == last)
 
 
 @pytest.mark.parametrize("after_restart", ["hold", "resume", "configured"])
@@ -96,12 +106,6 @@ def test_what_a_controller_that_was_killed_does_when_it_is_started_again(hil: Hi
     status, after = hil.status("controller"), shown(hil)
     assert (status.reference_from, status.gains_from) == (after.reference_from, after.gains_from)
     assert after.session == status.session != before.session
-    if after_restart == "hold":
-        pasted = op(hil, "show").splitlines()[1]
-        verb, *words = shlex.split(pasted, comments=True)[2:]
-        op(hil, verb, *words[: words.index("--set")])
-        now = shown(hil)
-        assert (now.reference, now.reference_from) == (after.reference, "operator")
     log = hil.log
     truths = [truth for _, truth in log.messages(Truth)]
     driven = [truth for truth in truths if truth.session == after.session]

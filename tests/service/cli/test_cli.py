@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,6 +21,14 @@ from aeroloop.protocol.transport.zenoh_config import THREADS
 from aeroloop.service.cli.main import app, execute
 from aeroloop.service.cli.processes import run_role
 from aeroloop.service.config import load
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """The signals that are blocked after a test are those of before: a daemon in this process takes them over."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -42,21 +52,20 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("lab experiment --bits 1/6", "--bits: "),
         ("lab experiment --config no/such.toml", "no/such.toml"),
         ("lab experiment --speed 9", "--speed"),
-        ("stop", "did you mean `aeroloop op stop`?"),
         ("op stpo", "Did you mean 'stop'?"),
-        ("lab replay", "did you mean `aeroloop log replay`?"),
+        ("stop", "No such command 'stop'"),
         ("recordr", "Did you mean 'recorder'?"),
         ("demo --set vehicle=a/b", "vehicle"),
         ("demo --duration x", "'--duration'"),
         ("demo --duration 0", "greater than or equal to 0.01"),
         ("op set-gains --C1 1 2 --json", "give each gain as --NAME and its numbers, such as --C2 0.2 0.2 0.2"),
-        ("op track hold --amplitude 1 2 3", "amplitude"),
-        ("op track configured --timeout 1", "configured takes no option but --in"),
-        ("op inject rate:x", "drop and garble"),
+        ("op track configured --amplitude 1 2 3", "configured takes no option but --in"),
+        ("op inject", "name a fault, such as rate:off@1..2, or give --clear"),
+        ("op inject motors:bias=1e308", "bias takes -48 to 48 V, not 1e+308"),
         ("log export a.mcap --format foo", "'foo' is not one of 'parquet', "),
         ("log review a.mcap --from 3 --to 2", "--from 3 is not before --to 2"),
-        ("log review a.mcap --session", "see `aeroloop log review --help`"),
-        ("plant --fault rate:off --set plant.via=can", "--fault is for the emulator, and plant.via is can"),
+        ("log review a.mcap --session", "'--session' requires an argument"),
+        ("log review a.mcap --speed", "see `aeroloop log review --help`"),
         ('demo --set plant.faults=["rate:x"]', "drop and garble, not "),
     ],
 )
@@ -122,13 +131,6 @@ def test_help_and_an_operators_stop_wait_for_no_mathematics(words: tuple[str, ..
     imported = set(printed.splitlines()[-1].split())
     assert "aeroloop.service.cli.op" in imported
     assert not imported & {"casadi", "scipy", "mcap", "matplotlib", "plotly", "aeroloop.service.config"}
-
-
-def test_a_terminal_that_lacks_characters_shows_question_marks() -> None:
-    command = [sys.executable, "-P", "-m", "aeroloop", "lab", "certify", "--help"]
-    environment = {**os.environ, "PYTHONIOENCODING": "latin-1"}
-    printed = subprocess.run(command, check=True, capture_output=True, encoding="latin-1", env=environment).stdout
-    assert "?/?/u" in printed
 
 
 def test_zenoh_gets_several_threads_in_a_daemon_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.emulator import run_emulator
 from aeroloop.protocol.messages.models import Percentiles, Status, Timing
 from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
-from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.service.cli.main import execute as run
-from aeroloop.service.config import load
-from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.host.health import LATE_SHARE, SILENT_S, Trouble, troubles
-from aeroloop.service.host.operator import Gathered, OperatorError, gather
+from aeroloop.service.host.operator import Gathered, gather
 from tests.support.clock import FakeClock
 from tests.support.zenoh_network import Gathering, eventually
 
@@ -44,6 +37,11 @@ def of(controller: Status | None = CONTROLLER, plant: Status | None = PLANT, *si
 def test_a_loop_that_is_driven_in_time_is_well() -> None:
     assert of() == []
     assert troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT}}, [])) == []  # without a recorder
+
+
+def with_recorder(state: str, **more: Any) -> list[Trouble]:
+    recorder = status("recorder", state, **more)
+    return troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
 
 
 SLOW = PERIOD.model_copy(update={"p99": PERIOD.p50 + 1})
@@ -73,6 +71,13 @@ LATE = int(LATE_SHARE * PERIOD.count) + 1
             "recorder",
             "recorder is gone",
         ),
+        (
+            with_recorder(NOT_RECORDING, cause="the disk is full"),
+            "not recording",
+            "recorder",
+            "nothing: the disk is full",
+        ),
+        (with_recorder("recording", lost=7), "lossy", "recorder", "lost 7 messages"),
         (of(CONTROLLER, PLANT, "the recorder at x does not answer"), "silent", None, "recorder at x"),
     ],
 )
@@ -114,6 +119,8 @@ def test_a_loop_that_hangs_is_known_by_the_age_of_its_status(capfd: pytest.Captu
         assert judged["well"] is False
         assert [trouble["kind"] for trouble in judged["troubles"]] == ["missing", "silent"]
         assert judged["vehicles"]["aero"]["plant"]["state"] == "driven"
+        assert run(["op", "status", "--set", network, "--set", "vehicle=beta"]) == 1
+        assert capfd.readouterr().err == "aeroloop: no role of beta answers, only of aero\n"
 
 
 def test_skipped_ticks_are_counted_over_the_last_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,91 +134,14 @@ def test_skipped_ticks_are_counted_over_the_last_ten_seconds(monkeypatch: pytest
     assert published == [0, 2, 2, 0, 1]
 
 
-def test_a_recorder_that_cannot_write_is_a_trouble() -> None:
-    recorder = status("recorder", NOT_RECORDING, cause="the disk is full")
-    (trouble,) = troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
-    assert (trouble.kind, trouble.role) == (NOT_RECORDING, "recorder")
-    assert trouble.text == "aero's recorder records nothing: the disk is full"
-
-
-def test_a_recorder_that_lost_messages_is_a_trouble() -> None:
-    recorder = status("recorder", "recording", lost=7)
-    (trouble,) = troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
-    assert (trouble.kind, trouble.role) == ("lossy", "recorder")
-    assert "lost 7 messages" in trouble.text
-
-
-@contextmanager
-def ends(network: NetworkSettings, *, require_recorder: bool) -> Iterator[None]:
-    """An armed plant and a controller in this process, in real time."""
-    words = [
-        "loop.realtime=off",
-        "loop.rate_hz=50",
-        "plant.watchdog_s=5",
-        "controller.stale_s=5",
-        "wire.counter_bits=16",
-    ]
-    settings = load(overrides=[*words, "plant.armed_at_start=true", f"controller.require_recorder={require_recorder}"])
-    with Node("plant", "aero", network, {}) as plant, Node("controller", "aero", network, {}) as controller:
-        threads = [
-            threading.Thread(target=run_emulator, args=(plant, settings.loop, settings.wire, settings.plant)),
-            threading.Thread(target=Daemon(controller, settings).run),
-        ]
-        for thread in threads:
-            thread.start()
-        try:
-            yield
-        finally:
-            for role in (controller, plant):
-                role.stop.set()
-            for thread in threads:
-                thread.join()
-
-
-@contextmanager
-def recorder(network: NetworkSettings, last: str) -> Iterator[None]:
-    """A recorder with its presence alone; `last` is the state in its last status."""
-    with Node("recorder", "aero", network, {}) as role:
-        role.announce()
-        role.status(status("recorder", "recording"))
-        yield
-        role.status(status("recorder", last))
-
-
-@pytest.mark.parametrize("require_recorder", [False, True])
-def test_a_recorder_that_was_there_or_is_required_is_missed_and_one_that_stopped_in_order_is_not(
-    require_recorder: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with Gathering() as gathering, ends(gathering.settings, require_recorder=require_recorder):
-        words = ["op", "status", "--check", "--json", "--set", f"network.rendezvous={gathering.settings.rendezvous[0]}"]
-
-        def missed() -> list[str]:
-            capfd.readouterr()
-            code = run(words)
-            found = json.loads(capfd.readouterr().out)["troubles"]
-            assert code == bool(found)
-            return [trouble["text"] for trouble in found if trouble["role"] == "recorder"]
-
-        def says(part: str) -> Callable[[], bool]:
-            return lambda: [part in text for text in missed()] == [True]
-
-        def uptimes() -> list[float]:
-            """Of the statuses of both ends; zeros before both have answered."""
-            with suppress(OperatorError, KeyError):
-                roles = gather(gathering.settings).statuses["aero"]
-                return [roles[role].uptime_s for role in ("controller", "plant")]
-            return [0.0, 0.0]
-
-        def after_two_statuses() -> list[str]:
-            since = uptimes()
-            eventually("two statuses", lambda: all(t > s + 1 for s, t in zip(since, uptimes(), strict=True)))
-            return missed()
-
-        eventually("statuses of both", lambda: min(uptimes()) > 0)
-        assert len(missed()) == require_recorder
-        with recorder(gathering.settings, "recording"):
-            eventually("nothing missed", lambda: not missed())
-        eventually("that it is gone", says("gone"))
-        with recorder(gathering.settings, STOPPED):
-            eventually("that it is back", lambda: not missed())
-        assert ["requires one" in text for text in after_two_statuses()] == [True] * require_recorder
+@pytest.mark.parametrize(("last", "gone"), [("recording", True), (STOPPED, False)])
+def test_a_recorder_is_gone_if_it_was_there_and_did_not_stop_in_order(last: str, gone: bool) -> None:
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as plant:
+        watch = RecorderWatch(plant)
+        assert not watch.gone
+        with Node("recorder", "aero", gathering.settings, {}) as role:
+            role.announce()
+            eventually("a recorder", lambda: watch.present)
+            role.status(status("recorder", last))
+        eventually("none", lambda: not watch.present)
+        eventually("its last status", lambda: watch.gone == gone)

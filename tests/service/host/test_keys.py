@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.transport.certificate import CertificateError, load, own_certificate, read_certificate
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host import keys
-from aeroloop.service.host.doctor import _certificates
+from aeroloop.service.host.doctor import certificate_findings
 from tests.support.certificates import DAY, Authority, common_name
 
 
@@ -68,10 +68,10 @@ def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -
     assert files(folder) == before
 
 
-def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
-    keys.init(tmp_path / "keys", days=30)
-    file = keys.issue(tmp_path / "keys", "operator", "Ada")
-    assert read_certificate(file).not_after == load(tmp_path / "keys" / "ca.pem").not_valid_after_utc
+def test_no_certificate_outlives_its_authority(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keys, "DAYS", keys.AUTHORITY_DAYS + 1)
+    file = keys.issue(folder, "operator", "Ada")
+    assert read_certificate(file).not_after == load(folder / "ca.pem").not_valid_after_utc
 
 
 @pytest.mark.parametrize(
@@ -101,11 +101,11 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     authority = Authority(tmp_path / "keys", days=100)
     authority.issue("plant", "aero", ends=50 * DAY)
     authority.issue("operator", ends=13 * DAY)
-    findings = {finding.what: finding for finding in _certificates(authority.folder)}
+    findings = {finding.what: finding for finding in certificate_findings(authority.folder)}
     assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
     assert "13 days left" in findings["operator.pem"].found
     assert "keys issue" in findings["operator.pem"].advice
-    words = ["host", "keys", "show", "--json", "--set", f"network.security.directory={authority.folder}"]
+    words = ["host", "keys", "show", "--json", "--directory", str(authority.folder)]
     assert run(words) == 0
     authority.issue("observer", ends=-DAY)
     assert run(words) == 1
@@ -113,8 +113,8 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     assert "expired" in rows["observer.pem"]["problem"]
     assert rows["plant.aero.pem"]["problem"] is None
     assert 49 < rows["plant.aero.pem"]["days_left"] < 51
-    assert not {finding.what: finding for finding in _certificates(authority.folder)}["observer.pem"].good
-    (missing,) = _certificates(tmp_path)
+    assert not {finding.what: finding for finding in certificate_findings(authority.folder)}["observer.pem"].good
+    (missing,) = certificate_findings(tmp_path)
     assert not missing.good
     monkeypatch.setenv("COLUMNS", "120")
     assert run([*words[:3], *words[4:]]) == 1
@@ -141,13 +141,13 @@ def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
 
 def test_the_command_line_makes_what_two_hosts_need(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     lab, far = tmp_path / "lab", tmp_path / "far"
-    configured = ["--set", f"network.security.directory={lab}"]
-    assert run(["host", "keys", "init", *configured]) == 0
-    assert run(["host", "keys", "issue", "operator", "Ada", "--days", "7", *configured]) == 0
-    assert run(["host", "keys", "issue", "plant", "bench", "--vehicle", "aero", "--directory", str(lab)]) == 0
+    there = ["--directory", str(lab)]
+    assert run(["host", "keys", "init", *there]) == 0
+    assert run(["host", "keys", "issue", "operator", "Ada", *there]) == 0
+    assert run(["host", "keys", "issue", "plant", "bench", "--vehicle", "aero", *there]) == 0
     assert capfd.readouterr().out.splitlines() == [f"{lab}/{file}.pem" for file in ("ca", "operator", "plant.aero")]
-    assert run(["host", "keys", "issue", "operator", *configured]) == 2
-    assert run(["host", "keys", "issue", "plant", "bench", *configured]) == 1
+    assert run(["host", "keys", "issue", "operator", *there]) == 2
+    assert run(["host", "keys", "issue", "plant", "bench", *there]) == 1
     far.mkdir()
     for name in ("ca.pem", "plant.aero.pem", "plant.aero.key"):
         shutil.move(lab / name, far)

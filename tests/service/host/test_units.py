@@ -90,27 +90,28 @@ def test_homes_are_hidden_unless_interpreter_or_configuration_lies_in_one(
     assert directives(units.CONFIG) == (config.owner(), None, "read-only")
 
 
-def test_units_are_not_replaced_unless_forced_and_the_next_steps_start_every_daemon(
+def test_units_are_written_with_the_steps_that_start_every_daemon(
     capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     install = ["host", "units", "--set", "network.mode=client", "--install", str(tmp_path)]
-    assert run(install) == 0
+    for _ in range(2):  # a second time over the first
+        assert run(install) == 0
     printed = capfd.readouterr().out
     *_, reload, enable, look = printed.splitlines()
     assert reload == "sudo systemctl daemon-reload"
     assert enable == "sudo systemctl enable --now " + " ".join(f"aeroloop-{name}" for name in UNITS)
     assert look == "aeroloop op status"
     assert f"sudo cp {tmp_path}/aeroloop-*.service /etc/systemd/system/" in printed
-    mine = tmp_path / "aeroloop-plant.service"
-    mine.write_text("mine")
-    assert run(install) == 1
-    assert str(mine) in capfd.readouterr().err
-    assert mine.read_text() == "mine"
-    assert run([*install, "--force"]) == 0
-    capfd.readouterr()
     assert run(install[:4]) == 0
-    assert mine.read_text() in capfd.readouterr().out
+    assert (tmp_path / "aeroloop-plant.service").read_text() in capfd.readouterr().out
     assert run(["host", "units", "--install", str(tmp_path / "nowhere")]) == 1
+
+
+def test_what_a_unit_cannot_see_in_tmp_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "a.toml").touch()
+    hidden = tmp_path.is_relative_to("/tmp")  # noqa: S108
+    assert run(["host", "units", "--config", str(tmp_path / "a.toml")]) == 0
+    assert (f"{tmp_path / 'a.toml'} is in /tmp, which units do not see" in capfd.readouterr().out) == hidden
 
 
 @pytest.mark.parametrize("via", VIAS)
@@ -141,9 +142,9 @@ def test_daemons_run_as_the_owner_of_their_keys(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("name", ["plant", "recorder"])
 def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, tmp_path: Path) -> None:
-    """The words of ExecStart, with a configuration that makes the daemon end at once, in a line of JSON."""
+    """The words of ExecStart, with a configuration that makes the daemon end at once."""
     config = tmp_path / "aero loop.toml"
     not_ours = 'listen = ["tcp/192.0.2.1:1"]'
     config.write_text(f'[network]\nrendezvous = ""\n{not_ours}\ninsecure = true\n')
@@ -154,5 +155,4 @@ def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, t
     assert overrides[0] in words
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
-    assert '"event": "failed"' in done.stderr
     assert "cannot listen on tcp/192.0.2.1:1" in done.stderr

@@ -139,6 +139,14 @@ def test_without_a_record_and_a_beginning_nothing_is_known(tmp_path: Path) -> No
         assert replay([log]).unknown == findings.unknown != []
 
 
+def test_ticks_before_the_first_that_the_controller_received_are_judged_by_no_reference(tmp_path: Path) -> None:
+    """A session follows nothing until its first measurement is received, and holds what it finds then."""
+    messages = made(load(), TICKS, {5: (None, AWAY)}, lost=set(range(5)))
+    found = read(write(tmp_path / "a.mcap", load(), messages))
+    assert found.ticks.k.tolist() == list(range(5, TICKS))
+    assert [(one.first_tick, one.last_tick) for one in found.findings.unknown] == [(0, 4)]
+
+
 def test_a_second_session_has_its_own_gains_and_reference(tmp_path: Path) -> None:
     """The record of one session says nothing about another."""
     changes: Changes = {300: (Gains(C2=(0.1, 0.1, 0.1)), LEVEL), 1100: (Gains(C2=(0.3, 0.3, 0.3)), None)}

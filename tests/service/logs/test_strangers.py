@@ -66,7 +66,7 @@ def foreign(topic: topics.Topic, role: str) -> Iterator[bytes]:
     if topic.name == "description":
         good = description(lockstep(), role)
         wide = {"rate": {"bits": HUGE}}
-        configs: list[dict[str, object]] = [{"law": 5}, {"wire": wide}, {"plant": []}]
+        configs: list[dict[str, object]] = [{}, {"lasers": {}}, {"law": 5}, {"wire": wide}, {"plant": []}]
         yield from (good.model_copy(update={"config": config}).encode() for config in configs)
         for wrong in ({"vehicle": "other"}, {"role": "operator"}, {"protocol": HUGE}, {"protocol": 1}):
             yield good.model_copy(update=wrong).encode()

@@ -101,7 +101,7 @@ def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
     out = " ".join(capfd.readouterr().out.split())
     assert out.index("duration") < out.index("before plant tripped trip of s1")
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
-    assert "sessions 1 s1, 0.4 s 2 s2, 0.2 s, shown --session N shows another of 2" in out
+    assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
 
 
 # Runs

@@ -1,18 +1,15 @@
-"""Live view of `op top`: what is published, as far as it is true now; its keys, on a pseudo-terminal."""
+"""Live view of `op top`: what is published, as far as it is true now."""
 
 from __future__ import annotations
 
-import os
-import termios
 from io import StringIO
 
-import pytest
 from rich.console import Console
 
 from aeroloop.protocol.messages.models import Event, Percentiles, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.host.health import SILENT_S
-from aeroloop.service.terminal.monitor import Top, keyboard
+from aeroloop.service.terminal.monitor import Top
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 TELEMETRY = Telemetry(
@@ -103,29 +100,3 @@ def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
     for words in ("12345/67890", "1234567", "99 d", "tripped"):
         assert words in shown
     assert cause in " ".join(shown.split())
-
-
-def test_what_is_not_understood_is_left_out() -> None:
-    view = driven()
-    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "else"):
-        view.top.receive(key, b'{"not": "a message"}')
-    assert "+12.5" in view.text()
-
-
-def test_keys_are_read_without_enter_and_the_terminal_is_restored_also_after_an_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    user, program = os.openpty()
-    with os.fdopen(program, "r") as stdin:
-        monkeypatch.setattr("sys.stdin", stdin)
-        before = termios.tcgetattr(program)
-        with pytest.raises(KeyboardInterrupt), keyboard() as read:  # noqa: PT012  # what is raised comes from the block
-            assert not termios.tcgetattr(program)[3] & (termios.ECHO | termios.ICANON)
-            assert read(0.0) == ""
-            os.write(user, b"aq")
-            assert read(60.0) == "aq"
-            os.write(user, b"\x1b[A")
-            assert read(60.0) == ""
-            raise KeyboardInterrupt
-        assert termios.tcgetattr(program) == before
-    os.close(user)

@@ -1,9 +1,7 @@
-"""Printer of results: the same rows for a terminal of any width, as Markdown, CSV and JSON."""
+"""Printer of results: the same rows for a terminal of any width, and as Markdown."""
 
 from __future__ import annotations
 
-import csv
-import json
 from io import StringIO
 
 import pytest
@@ -55,13 +53,6 @@ def test_markdown_has_every_cell_and_numbers_but_no_sentences_to_the_right(capsy
     show_all([("laws", rows), ("a note", [])], "markdown")
     table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | 2 samples |"]
     assert capsys.readouterr().out.splitlines() == ["**laws**", "", *table, "", "a note"]
-
-
-def test_csv_and_json_are_the_rows(capsys: pytest.CaptureFixture[str]) -> None:
-    show(ROWS, "laws", "csv")
-    assert list(csv.DictReader(StringIO(capsys.readouterr().out))) == ROWS
-    show(ROWS, "laws", "json")
-    assert json.loads(capsys.readouterr().out) == ROWS
 
 
 def test_a_certificate_shows_its_verdict_and_what_decides_and_on_request_every_term(
