@@ -101,7 +101,7 @@ def test_more_bits_are_never_worse() -> None:
     assert margins == sorted(margins)
     for radii in (
         [each.body_reach.radius if each.body_reach else inf for each in found],
-        [theorem_of(each).radius or inf for each in found if each.body_reach],
+        [inf if (radius := theorem_of(each).radius) is None else radius for each in found if each.body_reach],
     ):
         assert radii == sorted(radii, reverse=True)
         assert radii[-1] < radii[-2] < inf
