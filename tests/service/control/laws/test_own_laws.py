@@ -70,6 +70,12 @@ def test_a_users_law_has_its_own_settings_checked_by_its_own_model() -> None:
         assert key in refused(EXPRESSIONS, f"law.{override}")
 
 
+def test_a_laws_keys_hold_whether_they_are_given_before_or_after_its_kind() -> None:
+    given = ["law.kind=pd", "law.damping_bound=0.02", "law.kp=[1, 2, 3]"]
+    assert load(overrides=given).law == load(overrides=given[::-1]).law
+    assert load(overrides=given[::-1]).law.model_dump()["kp"] == (1.0, 2.0, 3.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
