@@ -143,20 +143,24 @@ def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
         value = value_of(text.strip())
         for name in reversed(key.strip().split(".")):
             value = {name: value}
-        tree = merged(tree, value)
+        tree = merged(tree, value, one_source=True)
     return tree
 
 
-def merged(weaker: dict[str, Any], stronger: dict[str, Any]) -> dict[str, Any]:
-    """Two trees as one. A law or a reference of another kind replaces the weaker one; a law keeps the body."""
+def merged(weaker: dict[str, Any], stronger: dict[str, Any], *, one_source: bool = False) -> dict[str, Any]:
+    """Two trees as one. A law or a reference of another kind replaces the weaker one; a law keeps the body.
+
+    Of `one_source` nothing is weaker: a law's keys hold whether they stand before or after its kind.
+    """
     tree = weaker | stronger
     for name in weaker.keys() & stronger.keys():
         old, new = weaker[name], stronger[name]
         if isinstance(old, dict) and isinstance(new, dict):
             default, kept = _KINDS.get(name, (None, ()))
-            if default and new.get("kind", default) != old.get("kind", default) and "kind" in new:
+            another_kind = "kind" in new and new["kind"] != old.get("kind", default)
+            if default and another_kind and not one_source:
                 old = {key: old[key] for key in kept if key in old}
-            tree[name] = merged(old, new)
+            tree[name] = merged(old, new, one_source=one_source)
     return tree
 
 

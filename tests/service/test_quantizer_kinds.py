@@ -1,4 +1,4 @@
-"""Kinds of quantizers through the whole loop: experiment, log, replay, certificate and command line."""
+"""Kinds of quantizers through the whole loop: log, replay and certificate."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pyarrow.parquet
 import pytest
 
 from aeroloop.protocol.wire.spec import Kind
-from aeroloop.service.cli.main import execute as run
-from aeroloop.service.config import ConfigError, Settings, load, load_over, with_bits
+from aeroloop.service.config import Settings, load_over
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import Recording
@@ -37,34 +36,6 @@ def throughout(kind: str, *more: str) -> Settings:
 def replayed(path: Path) -> SessionReplay:
     (session,) = replay([path]).sessions
     return session
-
-
-# ── the loop ──
-
-
-@other_kinds
-def test_the_experiment_runs_repeats_and_is_not_that_of_the_uniform_kind(kind: str) -> None:
-    settings = throughout(kind)
-    figures = run_experiment(settings, 5.0)
-    assert figures == run_experiment(settings, 5.0)
-    assert figures.z_track is not None
-    uniform = run_experiment(throughout("uniform"), 5.0).z_track
-    assert uniform is not None
-    assert figures.z_track != uniform
-    # Errors of up to twice the uniform ones, whose squares are most of z_track; not a loop that has come apart.
-    assert figures.z_track < 5 * uniform
-
-
-@other_kinds
-def test_more_bits_bring_every_kind_to_the_loop_without_quantization(kind: str) -> None:
-    fine = run_experiment(with_bits(throughout(kind), "16/16"), 5.0)
-    continuous = run_experiment(with_bits(throughout(kind), "cont/cont"), 5.0)
-    # 16 bits err by 3e-5 at the most, against an ε̃ of 1e-2: a few parts in a thousand.
-    assert fine.z_track == pytest.approx(continuous.z_track, rel=5e-3)
-    assert fine.u_total == pytest.approx(continuous.u_total, rel=5e-3)
-
-
-# ── the log ──
 
 
 @other_kinds
@@ -111,9 +82,6 @@ def test_review_and_export_have_the_levels_that_were_sent_and_which_saturated(ki
     assert table["rate_z_rad_s"] == [level(frame[1][5]) for frame in seen if frame is not None]
 
 
-# ── the certificate ──
-
-
 @every_kind
 def test_the_certificate_takes_the_bound_of_each_kind(kind: str) -> None:
     settings = certified_settings(12, 12, *(f"wire.{signal}.kind={kind}" for signal in SIGNALS))
@@ -121,35 +89,3 @@ def test_the_certificate_takes_the_bound_of_each_kind(kind: str) -> None:
     assert found.holds
     for symbol, signal, elements in (("‖δ_ε‖", wire.attitude, 3), ("‖δ_ω‖", wire.rate, 3), ("‖δ_u‖", wire.voltage, 3)):
         assert found.value(symbol) == sqrt(elements) * signal.quantizer().bound
-
-
-# ── the command line ──
-
-
-@pytest.mark.parametrize(
-    ("overrides", "expected"),
-    [
-        (["wire.rate.hysteresis=0.1"], "wire.rate: hysteresis belongs to kind"),
-        (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.bits=2"], "wire.voltage: a logarithmic-uniform"),
-    ],
-)
-def test_what_a_kind_does_not_take_is_reported_in_one_line_that_names_the_signal(
-    overrides: list[str], expected: str, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load(overrides=overrides)
-    assert str(caught.value).startswith(expected)
-    assert run(["show", "spec", *(word for change in overrides for word in ("--set", change))]) == 2
-    captured = capfd.readouterr()
-    assert captured.err == f"aeroloop: {caught.value}\n"
-    assert captured.out == ""
-
-
-def test_show_spec_prints_the_kind_and_what_it_does(capfd: pytest.CaptureFixture[str]) -> None:
-    kinds = ["wire.attitude.kind=hysteresis-uniform", "wire.voltage.kind=logarithmic-uniform"]
-    assert run(["show", "spec", *(word for change in kinds for word in ("--set", change))]) == 0
-    shown = " ".join(capfd.readouterr().out.split())
-    assert "ε attitude hysteresis-uniform 8 ±1 0.00784314 0.00784314" in shown
-    assert "ω rate uniform 8" in shown
-    assert "ε attitude: a level is held for 0.00392157 beyond its interval" in shown
-    assert "u voltage: 0 within ±0.0952381 V, then 18 steps that grow from 0.0246 V up to ±6 V, and 13 alike" in shown

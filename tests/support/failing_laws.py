@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
@@ -16,7 +15,7 @@ from aeroloop.service.control.laws.interface import Floats
 
 FAILING: Final = "tests.support.failing_laws"
 
-Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape", "another name", "gives no number"]
+Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape"]
 
 
 class FailingSettings(LawSettings):
@@ -49,20 +48,13 @@ class Failing(PythonLaw[FailingSettings]):
                 return [1.0]
             case "another shape":
                 self.state["ticks"] = np.zeros(2)
-            case "another name":
-                self.state = {"tocks": np.zeros(1)}
-            case "gives no number":
-                return ["much"] * self.actuators
         return [1.0] * self.actuators
-
-
-Mistake = Literal["width", "state", "one value", "iterates", "no such setting", "no such vector", "initial"]
 
 
 class MistakenSettings(LawSettings):
     """Which of a beginner's mistakes is made."""
 
-    mistake: Mistake = Field(description="what is wrong with it")
+    mistake: Literal["width", "state", "no such vector"] = Field(description="what is wrong with it")
 
 
 class Mistaken(ExpressionLaw[MistakenSettings]):
@@ -71,7 +63,7 @@ class Mistaken(ExpressionLaw[MistakenSettings]):
     Settings = MistakenSettings
 
     def initial(self) -> Mapping[str, Sequence[float]]:
-        return {"sum": 0.0 if self.settings.mistake == "initial" else (0.0, 0.0)}  # type: ignore[dict-item]
+        return {"sum": (0.0, 0.0)}
 
     def expressions(self, now: Now[ca.SX]) -> Any:
         zero = ca.SX.zeros(self.actuators)
@@ -80,12 +72,6 @@ class Mistaken(ExpressionLaw[MistakenSettings]):
                 return now.rate_error[0], now.state
             case "state":
                 return zero, {"sum": now.rate_error}
-            case "one value":
-                return zero
-            case "iterates":
-                _x, _y, _z = now.rate  # iterates
-            case "no such setting":
-                return self.settings.kz * zero, now.state  # type: ignore[attr-defined]  # no such setting
             case "no such vector":
                 return now.speed, now.state  # type: ignore[attr-defined]  # no such vector
         return zero, now.state
@@ -107,16 +93,6 @@ class Picky(PythonLaw[LawSettings]):
         return now.rate
 
 
-class NoSettings(PythonLaw[LawSettings]):
-    """Has no model of its settings."""
-
-    def reset(self) -> None:
-        pass
-
-    def step(self, now: Now[Floats]) -> Floats:
-        return now.rate
-
-
 class Runaway(ExpressionLaw[LawSettings]):
     """Pushes where it should pull."""
 
@@ -124,12 +100,6 @@ class Runaway(ExpressionLaw[LawSettings]):
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
-
-
-class NoSuchGain(Runaway):
-    """Names a gain that its settings do not have."""
-
-    gains = ("kz",)
 
 
 class FourthTick(PythonLaw[LawSettings]):
@@ -163,13 +133,6 @@ class Hanging(FourthTick):
     def fail(self) -> None:
         while True:
             pass
-
-
-class Slow(FourthTick):
-    """Takes 0.3 s."""
-
-    def fail(self) -> None:
-        time.sleep(0.3)
 
 
 class NoLaw:

@@ -142,10 +142,3 @@ class Offset(ExpressionLaw[OffsetSettings]):
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return ca.repmat(now.gains["offset"] - 2, self.actuators, 1), {}
-
-
-class Stubborn(Offset):
-    """Takes its gain from its settings, where no change of gains reaches it."""
-
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:  # noqa: ARG002  # it ignores it
-        return ca.SX([self.settings.offset - 2] * self.actuators), {}

@@ -1,11 +1,11 @@
-"""Controller against the NumPy twin: in a whole loop, with the sign of Assumption 3, and with malformed frames.
+"""Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick.
 
-Every bit of a tick: `test_tick.py`; full turns: `tests/service/test_rigid_body_loop.py`.
+Full turns and the sign of Assumption 3: `tests/service/test_rigid_body_loop.py`.
 """
 
 from __future__ import annotations
 
-from math import cos, pi, radians, sin
+from math import radians
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.model.emulated import SUBSTEPS
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
-from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
@@ -25,50 +24,10 @@ from tests.support.twin_body import body_of
 
 PERIOD = 0.002
 LAW = AdaptiveSettings()
-LEVEL = Sinusoid(amplitude=(0.0, 0.0, 0.0))
-"""Hold q_d = [1, 0, 0, 0]."""
 CONTINUOUS = WireSpec().with_bits("cont/cont")
 
 
-def yawed(angle: float, k: int, wire: WireSpec = CONTINUOUS) -> bytes:
-    """The measurement of a body at rest that has yawed [rad]."""
-    eps = sent_vector((cos(angle / 2), 0.0, 0.0, sin(angle / 2)))
-    codes = [*map(wire.attitude.quantizer().encode, eps), *[wire.rate.quantizer().encode(0.1)] * 3]
-    return wire.measurement.pack(k % wire.measurement.counters, codes)
-
-
-@pytest.mark.parametrize("bits", ["8/6", "cont/cont"])
-def test_malformed_bytes_are_counted_and_leave_no_trace(bits: str) -> None:
-    wire = WireSpec(counter_bits=4).with_bits(bits)  # has padding
-    controller, untouched = (Controller(wire, LAW, Sinusoid(), PERIOD) for _ in range(2))
-    frame = yawed(0.3, 7, wire)
-    # 8 bits: the padding's last bit is set; cont: a bit of the gap after the counter is
-    padding = frame[:-1] + bytes([frame[-1] | 1]) if bits == "8/6" else bytes([frame[0] | 1]) + frame[1:]
-    for k, junk in enumerate((b"", frame[:-1], frame + b"\0", padding)):
-        assert controller.tick(junk, k) is None
-        assert controller.refused == k + 1
-    assert controller.tick(None, 8) is None
-    assert controller.tick(frame, 9) == untouched.tick(frame, 9)
-    assert controller.refused == 4
-
-
-def test_the_sign_is_that_of_the_first_error_and_stays() -> None:
-    near = Controller(CONTINUOUS, LAW, LEVEL, PERIOD)
-    near.tick(yawed(radians(100), 0), 0)
-    assert near.law_state["sign"] == (1,)
-
-    # yaw is at its crest of 170° at t = 0.5 s, tick 250
-    crest = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi))
-    far = Controller(CONTINUOUS, LAW, crest, PERIOD)
-    for k, yaw in enumerate((-170, -120, -60, 0, 60, 120, 170), start=250):  # first 20° the short way, then all round
-        far.tick(yawed(radians(yaw), k), k)
-        assert far.law_state["sign"] == (-1,)
-    # the desired yaw is 6 ticks past its crest: 170° (1 − cos 2°) = 0.12°, so ε̃ = sin 0.06°
-    assert far.attitude_error == pytest.approx((0.0, 0.0, sin(radians(85 * (1 - cos(0.012 * pi))))), abs=1e-12)
-
-
 def test_the_closed_loop_agrees_with_the_twins() -> None:
-    """Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick."""
     period_ns, reference = round(PERIOD * 1e9), Sinusoid()
     plant = ideal.PLANT.build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, period_ns, lockstep=True)

@@ -198,33 +198,14 @@ class Followed:
 
 
 @settings(max_examples=40)
-@given(
-    first=references,
-    changes=st.lists(st.tuples(references, seconds(0, 3), withins), min_size=1, max_size=4),
-)
-def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
-    first: Reference, changes: list[tuple[Reference, float, float]]
-) -> None:
-    """Also in the middle of an approach. q_d, ω_d and ω̇_d at the very time of the change, before it and after it."""
-    followed, t = Followed(first), 0.0
-    for reference, passed, within_s in changes:
-        t += passed
-        before, now = followed.at(t), states(followed.trajectory, t)
-        followed.follow(reference, t, Approach(within_s))
-        # At τ = 0 only c₀, c₁ and 2·c₂ count, which are the state itself; the products of three turns round on.
-        tolerance = 100 * EPS * (1 + np.abs(now).max()) ** 2
-        for left, right in zip(before, followed.at(t), strict=True):
-            assert np.abs(left - right).max() <= tolerance
-
-
-@settings(max_examples=40)
-@given(start=any_states(), reference=allowed, longer_s=seconds(0, 60), t=seconds(0, 20))
+@given(start=any_states(), reference=allowed, longer_s=seconds(0, 60), t=seconds(0, 20), at_once=st.booleans())
 def test_neither_angle_nor_rate_nor_acceleration_jumps_in_an_approach_or_between_points(
-    start: Angles, reference: Reference, longer_s: float, t: float
+    start: Angles, reference: Reference, longer_s: float, t: float, at_once: bool
 ) -> None:
+    """Wherever the approach begins, in one quintic or with braking before it."""
     target = Trajectory.of(reference)
     approach = shortest(target, start, BODY)
-    approach = approach.at_least(approach.within_s + longer_s)
+    approach = Approach(approach.within_s) if at_once else approach.at_least(approach.within_s + longer_s)
     trajectory = approached(target, start, t, approach)
     count = len(trajectory.starts) - len(target.starts)
     assert trajectory.starts[0] == t
@@ -474,20 +455,13 @@ ROLLS = Sinusoid(amplitude=(1.0, 0.0, 0.0), frequency=(0.3, 0.0, 0.0))
             BENCH,
             "max_reference_rate",
         ),
-        (Sinusoid(amplitude=(0.0, 61.0, 10.0), frequency=(0.0, 0.3, 0.3)), BENCH, "max_reference_tilt_deg"),
         # neither alone is too much: acos(cos² 50°) = 65.6°
         (Sinusoid(amplitude=(50.0, 50.0, 0.0), frequency=(0.3, 0.3, 0.0)), BODY, "max_reference_tilt_deg"),
-        (
-            Points(times=[0.0, 4.0, 8.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 60.5, 0.0), (0.0, 0.0, 0.0)]),
-            BENCH,
-            "max_reference_tilt_deg",
-        ),
         # sampled where pitch is 0, each time; and beyond 60° only after 848 s
         (Sinusoid(amplitude=(0.0, 80.0, 1.0), frequency=(0.0, 0.7, 0.7 / 32)), BENCH, "max_reference_tilt_deg"),
         (Sinusoid(amplitude=(0.0, 80.0, 0.0), frequency=(0.0, 0.001, 0.0)), BENCH, "max_reference_tilt_deg"),
         (Hold(attitude=(0.0, -60.1, 0.0)), BENCH, "max_reference_tilt_deg"),
         (ROLLS, BENCH, "roll"),
-        (Hold(attitude=(-0.1, 0.0, 0.0)), BENCH, "roll"),
     ],
 )
 def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
@@ -499,20 +473,11 @@ def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
     Trajectory.of(reference).check(NO_LIMITS)
 
 
-@pytest.mark.parametrize(
-    ("reference", "limits"),
-    [
-        (Sinusoid(), BENCH),
-        (Sinusoid(amplitude=(0.0, 60.0, 0.0), frequency=(0.0, 0.5, 0.0)), BENCH),
-        (Sinusoid(amplitude=(0.0, 0.0, 100.0), frequency=(0.0, 0.0, 0.5)), BENCH),
-        (Hold(attitude=(0.0, 59.9, 7200.0)), BENCH),
-        (Stream(), BENCH),
-        (ROLLS, BODY),
-        (Points(times=[0.0, 4.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 59.0, 100.0)]), BENCH),
-    ],
-)
-def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limits: Limits) -> None:
-    Trajectory.of(reference).check(limits)
+def test_what_stays_within_the_limits_is_not_refused() -> None:
+    steep = Points(times=[0.0, 4.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 59.0, 100.0)])
+    for reference in (Sinusoid(), Hold(attitude=(0.0, 59.9, 7200.0)), Stream(), steep):
+        Trajectory.of(reference).check(BENCH)
+    Trajectory.of(ROLLS).check(BODY)
 
 
 def test_a_sinusoid_that_is_too_fast_only_after_many_periods_is_refused() -> None:

@@ -134,10 +134,10 @@ def test_the_levels_of_a_frame_are_used_for_no_tick_before_its_own() -> None:
     assert [tick for tick in source.ticks if tick > 4][:2] == [8, 9]
 
 
-@pytest.mark.parametrize(("drift", "jitter_ns"), [(-1e-2, 150_000), (1e-4, 0), (1e-2, 150_000)])
-def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(drift: float, jitter_ns: int) -> None:
+@pytest.mark.parametrize("drift", [-1e-2, 1e-2])
+def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(drift: float) -> None:
     """The plant's period is longer or shorter by the controller's clock, up to one that runs 1 % fast or slow."""
-    last = 12_000
+    last, jitter_ns = 12_000, 150_000
     sent = []
     for each in heartbeats(last, {k: k % 7 for k in range(0, last, 11)}):
         k = (each.at_ns - DELAY_NS) // PERIOD_NS
@@ -161,19 +161,12 @@ def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes) -> None:
 
 
 def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None:
-    contents = [frame(0), *[UNCHANGED] * 14, frame(15), *[UNCHANGED] * 3]
+    """And ticks count on over a heartbeat that was lost, here that of tick 30."""
+    contents = [frame(0), *[UNCHANGED] * 14, frame(15), *[UNCHANGED] * 28, frame(45)]
     arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
     source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
-    ticks = source.run(7 * PERIOD_NS * 18)
-    assert [(each.tick, each.frame, each.missed) for each in ticks] == [(k, each, 0) for k, each in enumerate(contents)]
-
-
-def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost() -> None:
-    contents = [frame(0), *[UNCHANGED] * 14, *[UNCHANGED] * 14, frame(30)]  # the frame of tick 15 is not there
-    arrivals = [Arrival(content, PERIOD_NS * i) for i, content in enumerate(contents)]
-    source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
-    source.run(PERIOD_NS * 30)
-    assert source.ticks == [*range(29), 30]
+    ticks = source.run(7 * PERIOD_NS * 45)
+    assert [(each.tick, each.frame) for each in ticks] == list(zip([*range(44), 45], contents, strict=True))
 
 
 # Where every tick has a frame

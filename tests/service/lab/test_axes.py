@@ -47,34 +47,22 @@ def test_a_range_is_even_includes_both_ends_and_is_exact_in_decimals(low: Any, h
 
 
 def test_a_range_of_whole_numbers_stays_whole_where_it_can_and_stands_among_other_values() -> None:
-    for text, expected in (("6..12*4", [6, 8, 10, 12]), ("6..7*3", [6, 6.5, 7]), ("cont,4..6*2", ["cont", 4, 6])):
-        [axis] = parse_axes([f"wire.rate.bits={text}"])
-        found = values_of(axis)
-        assert found == expected
-        assert list(map(type, found)) == list(map(type, expected))
+    [axis] = parse_axes(["wire.rate.bits=cont,6..7*3"])
+    assert repr(values_of(axis)) == "['cont', 6, 6.5, 7]"
 
 
 @pytest.mark.parametrize(
     ("vary", "names"),
     [
         (["nonsense"], "'nonsense'"),
-        (["=1,2"], "section.key=a,b,c"),
-        (["wire.rate.bits="], "'wire.rate.bits='"),
         (["wire.rate.bits=cont,,8"], "a value is missing"),
-        (["wire.rate.bits=6..12*1"], "'6..12*1'"),
         (["wire.rate.bits=6..12"], "a..b*n"),
-        (["wire.rate.bits=8..8*3"], "'8..8*3'"),
         (["wire.rate.bits=8,17"], "wire.rate.bits: should be less than or equal to 16, not 17"),
-        (["wire.rate.bits=6..7*3"], "6.5"),
         (["wire.rate.bitz=8"], "did you mean wire.rate.bits?"),
-        (["wire.counter_bits=4,8", "loop.rate_hz=500,1000"], "counter_bits = 4 counts"),
         (["wire.rate.bits=8,8"], "the same twice"),
-        (["wire.rate.bits=8", "wire.rate.bits=9"], "gives wire.rate.bits twice"),
         (["plant.wind.seed=1,2"], "--seeds"),
         (["recorder.max_file_mb=1,2"], "law, loop, plant, reference, wire"),
         (["wire.rate.limit=1..2*9999", "wire.attitude.limit=0.5..1*9999"], "at most"),
-        (["wire.rate.limit=1e999999999..2*3"], "wire.rate.limit"),
-        (["wire.rate.kind*=2"], "factors are numbers"),
         (["law.C2*=1,two"], "factors are numbers"),
         (["law.C2*=2", "law.C2=[1,1,1]"], "gives law.C2 twice"),
     ],

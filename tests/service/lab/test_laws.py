@@ -1,22 +1,26 @@
-"""Comparison of laws: the settings of each, that a law which fails is a row, and what is printed of all."""
+"""Comparison of laws: the settings of each, what each survives, that a law which fails is a row; what is printed."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import pytest
 
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.baselines import response_of
 from aeroloop.service.lab.engine import figures_row, run_of
 from aeroloop.service.lab.laws import LAWS, compared_laws
-from aeroloop.service.lab.margins import survived
+from aeroloop.service.lab.margins import WITHIN_DEG, Late, largest_error_deg, survived
 from aeroloop.service.theorem.certificate import certify
 from tests.support.failing_laws import FAILING
 from tests.support.in_this_process import run_here
 
 SLOW = load(overrides=["loop.rate_hz=100"])
+PD = load_over(SLOW, ["law.kind=pd"])
+S = 4.0
 NO_GAMMA = ", Γ = 0"
 RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 
@@ -24,14 +28,6 @@ RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 def compared(settings: Settings, *laws: str) -> dict[str, Settings]:
     """The configuration of every law."""
     return {name: load_over(settings, overrides) for name, overrides in compared_laws(settings, laws).items()}
-
-
-def test_by_default_every_law_of_ours_is_compared_and_one_that_adapts_also_without() -> None:
-    found = compared(SLOW)
-    assert set(found) == {*LAWS, "adaptive, Γ = 0", "adaptive-torque, Γ = 0"}
-    for name, settings in found.items():
-        assert settings.law.kind == {"adaptive, Γ = 0": "nonadaptive"}.get(name, name.removesuffix(NO_GAMMA))
-        assert settings.plant == SLOW.plant
 
 
 def test_others_have_the_response_that_the_configured_gains_give_and_a_configured_law_stays_as_it_is() -> None:
@@ -52,7 +48,8 @@ def test_others_have_the_response_that_the_configured_gains_give_and_a_configure
 def test_without_adaptation_a_law_is_the_same_but_for_its_adaptation_gains(configured: str) -> None:
     """And what is known of the damping is the same for all laws, so that their bounds compare."""
     own = load_over(SLOW, [f"law.kind={configured}", "law.damping_bound=0.02", "law.damping_estimate=[0, 0.01, 0.02]"])
-    found = compared(own, "adaptive", "adaptive-torque", "pd")
+    found = compared(own)
+    assert set(found) == {*LAWS, "adaptive, Γ = 0", "adaptive-torque, Γ = 0"}
     laws = {name: settings.law.model_dump() for name, settings in found.items()}
     for law in laws.values():
         assert (law["damping_bound"], law["damping_estimate"]) == (0.02, (0.0, 0.01, 0.02))
@@ -98,3 +95,53 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     [line] = [line for line in text.splitlines() if line.startswith("| pd |")]
     assert line.startswith(f"| pd | {pd['pointwise_deg']:.2f}° | {pd['z_track'] * 1e4:.1f}; ")
     assert line.endswith(f"| {pd['delay_ms']:g} ms | {pd['lost_frames']} |")
+
+
+# Margins: commands that act late or never
+
+
+def test_what_a_law_survives_is_the_last_step_before_the_bound() -> None:
+    found = survived(PD, S)
+    ticks, frames = round(found["delay_ms"] / 10), found["lost_frames"]
+    assert ticks > 0
+    assert frames > 0
+    for kept, too_late in (((ticks, 0), (ticks + 1, 0)), ((0, frames), (0, frames + 1))):
+        errors = [largest_error_deg(PD, S, *late) for late in (kept, too_late)]
+        assert errors[0] <= WITHIN_DEG < errors[1]
+
+
+def test_a_law_that_runs_away_survives_nothing() -> None:
+    runaway = load(overrides=["loop.rate_hz=100", f"law.kind={FAILING}:Runaway"])
+    assert survived(runaway, S) == {"delay_ms": None, "lost_frames": None}
+
+
+class Recording(EmulatedPlant):
+    """Keeps what is in force in every period."""
+
+    def __init__(self) -> None:
+        self.actuators, self.periods = 3, list[float]()
+        self.in_force: tuple[float, ...] = (0.0,)
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.in_force = tuple(voltages)
+
+    def advance(self) -> None:
+        self.periods.append(self.in_force[0])
+
+
+@pytest.mark.parametrize(
+    ("delay", "lost", "in_force"),
+    [
+        (0, 0, [1, 2, 3, 4, 5, 6, 7]),
+        (2, 0, [0, 0, 1, 2, 3, 4, 5]),
+        (0, 2, [1, 1, 1, 4, 4, 4, 7]),
+        (1, 1, [0, 0, 2, 2, 4, 4, 6]),
+    ],
+)
+def test_a_command_acts_late_or_until_the_next_that_is_not_lost(delay: int, lost: int, in_force: list[float]) -> None:
+    body = Recording()
+    plant = Late(body, delay, lost)
+    for k in range(1, 8):
+        plant.actuate([float(k)] * 3)
+        plant.advance()
+    assert body.periods == in_force

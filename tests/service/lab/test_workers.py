@@ -57,20 +57,6 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return out.read_bytes()
 
 
-@pytest.fixture(autouse=True)
-def _patience() -> Iterator[None]:
-    """A job that is lost would be waited for without end."""
-
-    def end(*_: object) -> None:
-        raise TimeoutError("the sweep does not end")
-
-    before = signal.signal(signal.SIGALRM, end)
-    signal.alarm(4 * int(PATIENCE_S))
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
 def test_results_come_in_the_order_of_the_runs_whichever_ends_first() -> None:
     counted = list[int]()
     rows = workers_here(2).rows(partial(rate_over, divisor=2), rates(*range(400, 440)), counted.append)
@@ -143,32 +129,6 @@ def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
 
 
 @pytest.mark.realtime  # a cluster of Dask's own processes
-def test_a_worker_with_several_threads_runs_one_experiment_at_a_time(tmp_path: Path) -> None:
-    """Threads of one process share compiled loops."""
-    with (
-        LocalCluster(n_workers=1, threads_per_worker=4, dashboard_address=":0") as threads,
-        open_workers(f"dask:{threads.scheduler_address}") as workers,
-    ):
-        workers.rows(partial(alone, path=str(tmp_path / "busy")), rates(*range(400, 420)))
-
-
-def alone(_settings: Settings, path: str) -> None:
-    """Fails if it runs in two threads at a time."""
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL))
-    time.sleep(0.02)
-    os.unlink(path)
-
-
-@pytest.mark.realtime  # a cluster of Dask's own processes
-def test_a_function_that_fails_on_a_cluster_fails_here(cluster: LocalCluster) -> None:
-    with open_workers(f"dask:{cluster.scheduler_address}") as workers:
-        work = partial(rate_over, divisor=2)
-        assert workers.rows(work, rates(400, 500, 450)) == [200, 250, 225]
-        with pytest.raises(ZeroDivisionError):
-            workers.rows(partial(rate_over, divisor=0), rates(400))
-
-
-@pytest.mark.realtime  # a cluster of Dask's own processes
 def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
     name = "from aeroloop.service.lab import engine as w; w.code_version ="
     with Client(cluster.scheduler_address, set_as_default=False) as client:
@@ -194,9 +154,3 @@ def test_where_there_is_no_scheduler_or_no_worker_one_line_says_so(
 def test_an_engine_that_is_none_is_refused(capfd: pytest.CaptureFixture[str], verb: str) -> None:
     assert execute(["lab", *verb.split(), "--engine", "spark"]) == 2
     assert capfd.readouterr().err == "aeroloop: --engine must be processes or dask:ADDRESS, not 'spark'\n"
-
-
-def test_without_dask_the_extra_is_named(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert execute(["lab", "tables", "--engine", "dask:127.0.0.1:1"]) == 1
-    assert capfd.readouterr().err.endswith("pip install 'aeroloop[dask]'\n")

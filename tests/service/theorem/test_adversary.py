@@ -13,6 +13,7 @@ from aeroloop.service.config import Settings, load_over
 from aeroloop.service.theorem.certificate import certify, evaluate, largest_voltage
 from aeroloop.service.theorem.invariant import reach
 from tests.support import adversary_loop as loop
+from tests.support import certified
 from tests.support.adversary_loop import Array
 from tests.support.ideal import IDEAL
 
@@ -54,11 +55,7 @@ PERFECT: Final = (
     "loop.lockstep=true", "plant.friction.viscous=[]", "plant.friction.coulomb=[]", *rotors(0, 0),
     "plant.sensors.attitude=perfect", "plant.sensors.rate=perfect",
 )  # fmt: skip
-FREE: Final = (
-    *PERFECT, "plant.kind=rigid_body", "plant.rigid_body.damping=[0, 0.006, 0.006]", "wire.actuators=3",
-    "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]",
-    "law.damping_bound=0.0119",
-)  # fmt: skip
+FREE: Final = ("loop.lockstep=true", *certified.FREE)
 AERO: Final = (
     *PERFECT, *swing("0, 10, 40", "0, 0.1, 0.07"), "plant.aero.centre_of_mass=[0, 0, -0.0038]", "wire.voltage.limit=60",
     "plant.friction.viscous=[0.0071, 0.022]", "law.damping_estimate=[0.022, 0.0071, 0.022]", "law.damping_bound=0.003",

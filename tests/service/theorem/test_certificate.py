@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import json
 import re
-from math import degrees, hypot, pi, radians, sqrt
+from math import degrees, hypot, inf, pi, radians, sqrt
 
 import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.operator import Hold
-from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion
-from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.cli.main import execute as run
-from aeroloop.service.config import Settings, load, load_over
+from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.theorem.bounds import Theorem, attitude_error
-from aeroloop.service.theorem.certificate import RESOLUTION_S, Evaluated, certify, described_certificate, evaluate
+from aeroloop.service.theorem.bounds import Theorem
+from aeroloop.service.theorem.certificate import RESOLUTION_S, Evaluated, certify, evaluate
 from tests.support.certified import FREE, bits, certified_settings
 from tests.support.ideal import IDEAL
 
 PAPER = Settings()
-KEYS = [
-    "holds", "pointwise_radius", "pointwise_deg", "plant_radius", "plant_deg", "constant_radius", "delay_ms",
-    "lost_frames", "assumptions", "violated", "terms",
-]  # fmt: skip
 SMALL = ["law.damping_bound=0.0119"]
 
 
@@ -91,8 +85,10 @@ def test_the_verdict_comes_first_the_exit_code_follows_it_and_json_has_every_equ
     assert capfd.readouterr().out.startswith("The certificate does not hold: range: wire.rate.limit")
     assert run(("lab", "certify", "--json", *overrides)) == 0
     found = json.loads(capfd.readouterr().out)
-    assert list(found) == KEYS
-    assert len({term["symbol"] for term in found["terms"]}) == len(found["terms"])
+    assert list(found) == [
+        "holds", "pointwise_radius", "pointwise_deg", "plant_radius", "plant_deg", "constant_radius", "delay_ms",
+        "lost_frames", "assumptions", "violated", "terms",
+    ]  # fmt: skip
     equations = {number for term in found["terms"] for number in term["equation"].replace(",", " ").split()}
     assert {f"C.{n}" for n in range(50, 73)} <= equations
     value = {term["symbol"]: term["value"] for term in found["terms"]}
@@ -100,21 +96,15 @@ def test_the_verdict_comes_first_the_exit_code_follows_it_and_json_has_every_equ
 
 
 def test_more_bits_are_never_worse() -> None:
-    last: Evaluated | None = None
-    for n in (*range(4, 17), None):
-        now = evaluate(load_over(PAPER, [*SMALL, *bits(n, n)]))
-        if last is not None:
-            assert theorem_of(now).margin >= theorem_of(last).margin
-        if last is not None and last.body_reach is not None:
-            assert now.body_reach is not None
-            assert now.body_reach.radius < last.body_reach.radius
-            after, before = theorem_of(now).radius, theorem_of(last).radius
-            assert after is not None
-            assert before is not None
-            assert after < before
-        last = now
-    assert last is not None
-    assert last.body_reach is not None
+    found = [evaluate(load_over(PAPER, [*SMALL, *bits(n, n)])) for n in (*range(4, 17), None)]
+    margins = [theorem_of(each).margin for each in found]
+    assert margins == sorted(margins)
+    for radii in (
+        [each.body_reach.radius if each.body_reach else inf for each in found],
+        [inf if (radius := theorem_of(each).radius) is None else radius for each in found if each.body_reach],
+    ):
+        assert radii == sorted(radii, reverse=True)
+        assert radii[-1] < radii[-2] < inf
 
 
 def test_in_continuous_time_without_quantization_only_the_disturbance_is_left() -> None:
@@ -139,8 +129,8 @@ def test_other_laws_are_certified_by_the_same_set_and_have_no_paper_s_terms(kind
     assert not {"c₀", "√(δ_Q/k)"} & {term.symbol for term in found.terms}
     assert (found.lost_frames is None) == (kind == "pid")  # an integral does not advance without a measurement
     assert found.constant_radius == found.plant_radius
-    adaptive = certify(certified_settings(12, 12))
     if kind == "nonadaptive":
+        adaptive = certify(certified_settings(12, 12))
         assert adaptive.constant_radius == found.plant_radius
         assert (found.plant_radius or 9) < (adaptive.plant_radius or 0)
 
@@ -160,7 +150,6 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
     [
         ("plant.rotor.lag_up_s=0.154", "rotors that lag"),
         ("wire.rate.limit=0.28", "range: wire.rate.limit"),
-        ("wire.attitude.limit=0.7", "range: wire.attitude.limit"),
         ("wire.voltage.limit=1", "saturation: wire.voltage.limit"),
         ("plant.rigid_body.damping=[0.02, 0.02, 0.02]", "law.damping_bound"),
         ("plant.rigid_body.inertia=[0.03, 0.02, 0.02]", "inertia"),
@@ -218,28 +207,10 @@ def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     assert share.min() < 1.02 * c0
 
 
-@pytest.mark.parametrize("bits", [4, 8])
-@pytest.mark.parametrize("half_deg", [20.0, 60.0, 89.0, 90.0])
-def test_no_attitude_errs_by_more_than_k_eps_says_and_some_by_nearly_as_much(bits: int, half_deg: float) -> None:
-    quantizer = SignalSpec(bits=bits, limit=1).quantizer()
-    bound = attitude_error(sqrt(3) * quantizer.bound, radians(half_deg))
-    rng = np.random.default_rng(bits)
-    axis = rng.standard_normal((4000, 3))
-    axis[::2] = 1 + 0.02 * axis[::2]  # along the diagonal all three components err outwards at once
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    half = radians(half_deg) * rng.random(4000) ** 0.1
-    worst = 0.0
-    for w, *eps in np.hstack([np.cos(half)[:, None], np.sin(half)[:, None] * axis]).tolist():
-        x, y, z = map(quantizer.quantize, eps)
-        worst = max(worst, float(np.linalg.norm(np.subtract(received_quaternion(x, y, z, IDENTITY), (w, *eps)))))
-    assert 0.6 * bound < worst <= bound
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [
         ("reference.kind=stream", "a stream's set-points are not known beforehand"),
-        ("reference.amplitude=[0, 1e308, 0]", "the reference is too fast for floating-point numbers"),
         ("law.kind=sliding", "no theorem for this law, sliding"),
         ("law.allocation=[[1, 0, 0], [0, 1, 1], [0, 1, 1]]", "law.allocation (B) has no inverse"),
     ],
@@ -249,12 +220,6 @@ def test_of_what_nothing_can_be_certified_one_line_says_why(
 ) -> None:
     assert run(("lab", "certify", "--set", change)) == 1
     assert capfd.readouterr().err.startswith(f"aeroloop: {line}")
-
-
-def test_a_description_carries_what_certify_prints_or_nothing() -> None:
-    assert described_certificate(load()) == certify(load()).model_dump(mode="json")
-    for without in ("reference.kind=stream", "law.kind=sliding"):
-        assert described_certificate(load(overrides=[without])) is None
 
 
 def test_at_the_margins_it_holds_and_just_beyond_it_does_not() -> None:

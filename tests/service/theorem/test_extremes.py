@@ -14,7 +14,6 @@ from aeroloop.service.theorem.extremes import body_rates, chords, extremes, feed
 from tests.support.certified import certified_settings
 
 NEARLY_EQUAL = Sinusoid(amplitude=(60, 50, 80), frequency=(0.04, 0.04006, 0.04002))
-SLOWER = Sinusoid(amplitude=(60, 50, 80), frequency=(0.02, 0.02003, 0.02001))
 SLOW_ROLL = Sinusoid(amplitude=(85, 40, 40), frequency=(0.0009, 0.2, 0.2))
 UNEVEN = Sinusoid(amplitude=(40, 45, 80), frequency=(0.03, 0.013, 0.018))
 PAPER = Sinusoid()
@@ -42,16 +41,15 @@ def bounds(reference: Sinusoid) -> Floats:
     ("reference", "step_s", "duration_s"),
     [
         (NEARLY_EQUAL, 2.0, 320_000),
-        (SLOWER, 4.0, 640_000),
         (SLOW_ROLL, 0.1, 7_000),
         (UNEVEN, 0.5, 80_000),
         (PAPER, 0.001, 40),
         (LOCKED, 0.005, 126),
     ],
-    ids=["nearly equal", "slower", "slow roll", "uneven", "paper", "locked"],
+    ids=["nearly equal", "slow roll", "uneven", "paper", "locked"],
 )
 def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step_s: float, duration_s: float) -> None:
-    """At least once through every beat; the first four were exceeded by up to 33 % after some periods."""
+    """At least once through every beat; the first three were exceeded by up to 33 % after some periods."""
     run = Trajectory.of(reference).at(np.arange(0, duration_s, step_s)[None])
     reached, allowed = largest(reference, Angles(*(part[0] for part in run))), bounds(reference)
     assert np.all(reached <= allowed)
@@ -59,10 +57,9 @@ def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step
         assert np.all(reached >= 0.999 * allowed)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_the_largest(seed: int) -> None:
+def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_the_largest() -> None:
     """Frequencies that share no period, so that every combination of phases comes, some day."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     amplitude = tuple(rng.uniform((0, 0, 0), (80, 89, 300)).tolist())
     reference = Sinusoid(amplitude=amplitude, frequency=tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist()))
     allowed, reached = bounds(reference), np.zeros(9)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.bodies import AeroSettings, aero
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.interface import ExpressionLaw, Now
 from aeroloop.service.control.laws.registry import law_of
@@ -20,6 +19,7 @@ from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
 from aeroloop.service.theorem.invariant import Premises, distance, largest_start, reach
 from aeroloop.service.theorem.linear import Axis, responses, system
 from aeroloop.service.theorem.plant_bounds import PlantBounds
+from tests.support.adversary_loop import times as product
 
 SMALL = "law.damping_bound=0.0119"
 UNEQUAL = {
@@ -45,12 +45,6 @@ def balls(rng: np.random.Generator, radius: float, count: int) -> Floats:
     v = rng.standard_normal((count, 3))
     found: Floats = v / np.linalg.norm(v, axis=1, keepdims=True) * radius * rng.random((count, 1)) ** 0.1
     return found
-
-
-def product(p: Floats, q: Floats) -> Floats:
-    """p ∘ q of each row. Shape (n, 4)."""
-    scalar = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
-    return np.hstack([scalar, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])])
 
 
 def with_scalar(eps: Floats) -> Floats:
@@ -82,8 +76,7 @@ def commanded(
 
 @pytest.mark.parametrize("unequal", [False, True], ids=["one gain", "unequal"])
 @pytest.mark.parametrize("kind", list(UNEQUAL))
-@pytest.mark.parametrize("bits", [8, 12])
-def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str, unequal: bool, bits: int) -> None:
+def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str, unequal: bool) -> None:
     """What the linear equations leave of the derivatives of (C.1), (C.2) under a law that acts at once.
 
     The received state errs within the quantizers' bounds, θ and θ̂ are within their balls.
@@ -91,8 +84,8 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     changes = [f"law.kind={kind}", "law.inertia=[0.02, 0.022, 0.024]" if unequal else "law.gravity=9.81"]
     changes += ["law.voltage_limit=1e6"] if kind in ("pid", "adaptive-torque") else []  # within the set none saturates
     changes += ["law.damping_bound=0.002", "law.coulomb_bound=0.0005"] if kind == "adaptive-torque" else []
-    settings = settings_of(bits, *changes, *(UNEQUAL[kind] if unequal else ()))
-    p, law, rng, n = of(settings), settings.law, np.random.default_rng(bits), 20_000
+    settings = settings_of(8, *changes, *(UNEQUAL[kind] if unequal else ()))
+    p, law, rng, n = of(settings), settings.law, np.random.default_rng(8), 20_000
     at = reach(p, 0.005)
     assert at is not None
     J, B, period = np.array(law.inertia), np.array(law.allocation), settings.loop.period
@@ -146,23 +139,6 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
         allowed.append(at.D[3])
     assert np.all(np.array(found) <= allowed)
     assert np.all(np.array(found) >= 0.15 * np.array(allowed))
-
-
-@pytest.mark.parametrize(
-    ("C1", "C2"), [((0.3, 0.3, 0.3), (0.15, 0.15, 0.15)), ((3.0, 0.3, 3.0), (1.0, 1.0, 1.0)), ((1, 1, 1), (0.1, 1, 1))]
-)
-def test_an_error_of_the_attitude_moves_the_command_by_no_more_than_the_bound(C1: Vector, C2: Vector) -> None:
-    """Along the reference, an error d of the attitude alone: (I + C₁C₂) d + 2 C₂ d × R ω_d."""
-    p = of(settings_of(8, f"law.C1={list(C1)}", f"law.C2={list(C2)}", "law.inertia=[0.001, 0.001, 0.001]"))
-    law = p.law._replace(centre=(0.0,) * 3, radius=0.0, reach=0.0)
-    desired = p.desired._replace(rate=1.0, axis_rate=1.0, acceleration=0.0, jerk=0.0)
-    nothing = {"weight": 0.0, "delta_omega": 0.0, "delta_u": 0.0}
-    at = reach(replace(p, law=law, desired=desired, delta_q=lambda _: 1e-5, **nothing))  # type: ignore[arg-type]
-    assert at is not None
-    d, omega_d = np.random.default_rng(4).standard_normal((2, 100_000, 3))
-    d, omega_d = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (d, omega_d))
-    moved = (1 + np.array(C1) * C2) * d + 2 * np.array(C2) * np.cross(d, omega_d)
-    assert 0.7 < np.linalg.norm(moved, axis=1).max() * 1e-5 / at.noise <= 1
 
 
 PLAIN = Axis(

@@ -7,7 +7,6 @@ equal numbers.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -16,10 +15,10 @@ import pytest
 
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
 from aeroloop.protocol.wire.symbolic import Compiled
-from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, equations, projection
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, projection
 from aeroloop.service.control.laws.evaluation import law_function, received
-from aeroloop.service.control.laws.registry import LawError
 from tests.support import numpy_twin as twin
+from tests.support.adversary_loop import times as product
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
 
@@ -50,9 +49,9 @@ def _unit(rng: np.random.Generator, size: int) -> Array:
     return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
 
 
-def _point(rng: np.random.Generator, p: AdaptiveSettings, share: float = 1.0) -> Point:
-    """A moving state. Of a whole share of k_θ, every other θ̂ lies where the projection acts, up to k_θ/0.95."""
-    bound = share * p.damping_bound
+def _point(rng: np.random.Generator, p: AdaptiveSettings) -> Point:
+    """A moving state; every other θ̂ lies where the projection acts, up to k_θ/0.95."""
+    bound = p.damping_bound
     length = rng.uniform(1.0, 1 / 0.95) if rng.uniform() < 0.5 else rng.uniform()
     return Point(
         q=_unit(rng, 4),
@@ -78,61 +77,18 @@ def _array(value: ca.DM) -> Array:
     return np.array(value, dtype=np.float64).ravel()
 
 
-class ClosedLoop:
-    """The law on a body without quantization, and derivatives along it.
+class Tick:
+    """One tick of the law with three motors: its outputs by their names."""
 
-    The body is written out here and not taken from the project: kinematics as products of quaternions, gravity through
-    the last row of the rotation matrix.
-    """
+    def __init__(self, p: AdaptiveSettings, period: float) -> None:
+        self._function = law_function(Adaptive(p, period, 3))
+        self._gains = [*p.C1, *p.C2, *p.Gamma]
 
-    def __init__(self, p: AdaptiveSettings) -> None:
-        self._p = p
-        names = ("q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C1", "C2", "Gamma")
-        self._given = given = {name: ca.SX.sym(name, {"q": 4, "q_d": 4, "s": 1}.get(name, 3)) for name in names}
-        self.law = given | equations(p, 3, given)
-        self.true_theta = ca.SX.sym("true_theta", 3)
-        q, omega, q_d, omega_d, omega_d_dot, theta = (given[name] for name in names[:6])
-        self._moves = [
-            (q, _product(q, ca.vertcat(0, omega)) / 2),  # (C.1): ω in the body frame
-            (omega, self._omega_dot()),  # (C.2)
-            (q_d, _product(ca.vertcat(0, omega_d), q_d) / 2),  # (C.12): ω_d in the inertial frame
-            (omega_d, omega_d_dot),
-            (theta, self.law["tau"]),  # (C.23), which does not project
-        ]
-
-    def _omega_dot(self) -> ca.SX:
-        """(C.2) solved for ω̇, with the law's u."""
-        p, omega, J = self._p, self._given["omega"], ca.SX(self._p.inertia)
-        w, x, y, z = (self._given["q"][i] for i in range(4))
-        up = ca.vertcat(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))  # seen from the body
-        gravity = ca.cross(ca.SX(p.centre_of_mass), -p.mass * p.gravity * up)
-        motors = ca.SX(np.array(p.allocation)) @ self.law["u"]
-        return (gravity - ca.cross(omega, J * omega) - self.true_theta * omega + motors) / J
-
-    def rates(self, y: ca.SX) -> list[ca.SX]:
-        """ẏ as its addends, one for each thing that moves."""
-        return [ca.jacobian(y, x) @ x_dot for x, x_dot in self._moves]
-
-    def evaluator(self, *expressions: ca.SX) -> ca.Function:
-        """A function of a point's fields and the sign."""
-        *symbols, s, C1, C2, Gamma = self._given.values()
-        values = [ca.SX(gain) for gain in (self._p.C1, self._p.C2, self._p.Gamma)]
-        expressions = tuple(ca.substitute(list(expressions), [C1, C2, Gamma], values))
-        return ca.Function("values", [*symbols, self.true_theta, s], expressions)
-
-
-def _product(p: ca.SX, q: ca.SX) -> ca.SX:
-    """Hamilton's p ⊗ q, by its sixteen products."""
-    return ca.vertcat(
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    )
-
-
-def _values(function: ca.Function, x: Point, s: float) -> Sequence[Array]:
-    return [_array(v) for v in function(x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, x.true_theta, s)]
+    def __call__(self, x: Point, sign: float, theta: Array | None = None) -> dict[str, Array]:
+        state = [*(x.theta if theta is None else theta), sign]
+        motion = {"omega": x.omega, "q_d": x.q_d, "omega_d": x.omega_d, "omega_d_dot": x.omega_d_dot}
+        found = self._function(last=x.q, state=state, gains=self._gains, eps=_sent(x.q), **motion)
+        return {name: _array(value) for name, value in found.items()}
 
 
 def _close(a: Array, b: Array) -> bool:
@@ -143,43 +99,53 @@ def _close(a: Array, b: Array) -> bool:
 @both_signs
 @both_bodies
 def test_the_law_agrees_with_the_twin_at_moving_states(paper: bool, s: float) -> None:
-    rng = np.random.default_rng(1)
+    rng, period = np.random.default_rng(1), 0.002
     projected = 0
-    for _ in range(1 if paper else 20):
+    for _ in range(1 if paper else 5):
         p = AdaptiveSettings() if paper else _random_settings(rng)
-        loop = ClosedLoop(p)
-        law = loop.law
-        e = ca.vertcat(law["eta_e"], law["eps_e"])
-        function = loop.evaluator(e, *(law[name] for name in ("u", "theta_dot", "tau", "omega_e", "z1", "z2")))
-        for _ in range(100 if paper else 5):
+        tick = Tick(p, period)
+        for _ in range(100 if paper else 20):
             x = _point(rng, p)
-            t = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
-            expected = (t.e, t.u, t.theta_dot, t.tau, t.omega_e, t.z1, t.z2)
-            assert all(_close(a, b) for a, b in zip(_values(function, x, s), expected, strict=True))
+            found, body = tick(x, s), body_of(p)
+            t = twin.law(body, x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+            moved, outer = x.theta + period * t.theta_dot - body.centre, p.damping_bound / 0.95
+            after = body.centre + moved * min(1.0, outer / float(np.linalg.norm(moved)))
+            e = np.append(found["eta_e"], found["eps_e"])
+            pairs = ((e, t.e), (found["u"], t.u), (found["omega_e"], t.omega_e), (found["state_next"][:3], after))
+            assert all(_close(a, b) for a, b in pairs)
             projected += bool(np.any(t.theta_dot != t.tau))
     assert 10 < projected < 90  # of a hundred: both branches of the projection were drawn often
+
+
+def lyapunov(p: AdaptiveSettings, x: Point, s: float, omega_dot: Array, t: float) -> tuple[float, Array, Array]:
+    """V of (C.24), ε̃ and z₂ a little later than x; (C.1) and (C.12) turn q and q_d."""
+    J, C1, Gamma = map(np.array, (p.inertia, p.C1, p.Gamma))
+    q = x.q + t / 2 * product(x.q, np.append(0, x.omega))  # of length 1 but for t²
+    q_d = x.q_d + t / 2 * product(np.append(0, x.omega_d), x.q_d)
+    e = product(q_d * [1, -1, -1, -1], q)
+    omega_e = x.omega + t * omega_dot - twin.rotation(q).T @ (x.omega_d + t * x.omega_d_dot)
+    z2 = omega_e + s * C1 * e[1:]
+    wrong = x.true_theta - x.theta + t * Gamma * x.omega * z2  # (C.23), which does not project
+    return 2 * (1 - s * e[0]) + z2 @ (J * z2) / 2 + wrong @ (wrong / Gamma) / 2, e[1:], z2
 
 
 @both_signs
 @both_bodies
 def test_without_quantization_the_lyapunov_function_falls_exactly_as_c25_says(paper: bool, s: float) -> None:
+    """Along a body that is written out here, by differences."""
     rng = np.random.default_rng(3)
-    for _ in range(1 if paper else 10):
+    for _ in range(1 if paper else 4):
         p = AdaptiveSettings() if paper else _random_settings(rng)
-        loop = ClosedLoop(p)
-        z1, z2 = loop.law["z1"], loop.law["z2"]
-        wrong = loop.true_theta - loop.law["theta"]
-        V = ca.dot(z1, z1) + ca.dot(z2, ca.SX(p.inertia) * z2) / 2 + ca.dot(wrong, wrong / ca.SX(p.Gamma)) / 2  # (C.24)
-        power = ca.fabs(z2).T @ ca.fabs(ca.SX(np.array(p.allocation))) @ ca.fabs(loop.law["u"])
-        function = loop.evaluator(ca.vertcat(*loop.rates(V)), power, loop.law["eps_e"], z2)
+        tick, J = Tick(p, 0.002), np.array(p.inertia)
         for _ in range(30):
-            addends, through_B, eps_e, z_2 = _values(function, _point(rng, p), s)
-            promised = -eps_e @ np.diag(p.C1) @ eps_e - z_2 @ np.diag(p.C2) @ z_2  # (C.25) with (C.49)
-            # V̇ is a sum of large addends that cancel, z₂ᵀB u among them: it can be no more exact than 2e-16 of these,
-            # times the few hundred operations behind each.
-            scale = np.abs(addends).sum() + through_B.sum()
-            assert abs(addends.sum() - promised) <= 1e-12 * scale
-            assert promised < -1e-6 * scale  # what is claimed stands well above that tolerance
+            x = _point(rng, p)
+            weight = twin.rotation(x.q).T @ np.array([0, 0, -p.mass * p.gravity])
+            torque = np.cross(p.centre_of_mass, weight) + np.array(p.allocation) @ tick(x, s)["u"]
+            omega_dot = (torque - np.cross(x.omega, J * x.omega) - x.true_theta * x.omega) / J  # (C.2)
+            later, now, before = (lyapunov(p, x, s, omega_dot, t) for t in (1e-6, 0, -1e-6))
+            _, eps_e, z2 = now
+            promised = -eps_e @ np.diag(p.C1) @ eps_e - z2 @ np.diag(p.C2) @ z2  # (C.25) with (C.49)
+            assert (later[0] - before[0]) / 2e-6 == pytest.approx(promised, rel=1e-5, abs=1e-8)
 
 
 BOUND = 0.05  # k_θ, which is the projection's inner ball
@@ -222,7 +188,7 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     """Remark 5, with k_θ/0.95 for k_θ: at every tick and not only in continuous time."""
     rng = np.random.default_rng(10)
     p = AdaptiveSettings(Gamma=(0.02 * gain,) * 3)
-    tick, gains = law_function(Adaptive(p, 0.002, 3)), [*p.C1, *p.C2, *p.Gamma]
+    tick = Tick(p, 0.002)
     first = np.array(p.damping_estimate)
     theta = first + np.array([0.0, 0.0, p.damping_bound])
     x = _point(rng, p)
@@ -230,25 +196,11 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     for k in range(3000):
         if k % 300 == 0:
             x = _point(rng, p)  # another drive, kept long enough to press against the bound
-        desired = x.q_d, x.omega_d, x.omega_d_dot
-        theta = _array(tick(x.q, [*theta, 1.0], gains, _sent(x.q), x.omega, *desired)[2])[:3]
+        theta = tick(x, 1.0, theta)["state_next"][:3]
         pressed += bool(np.linalg.norm(theta - first) > p.damping_bound)
         # scaling to a length of k_θ/0.95 rounds in the last place
         assert np.linalg.norm(theta - first) <= p.damping_bound / 0.95 * (1 + 1e-14)
     assert pressed > 300
-
-
-@pytest.mark.parametrize(
-    "allocation",
-    [
-        ((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, 0.0011, 0.0011)),  # two motors that do the same
-        ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.0014, 0.00176)),  # an axis that no motor acts on
-    ],
-)
-def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float, float, float], ...]) -> None:
-    settings = AdaptiveSettings.model_validate({"allocation": allocation})
-    with pytest.raises(LawError, match=r"law\.allocation \(B\) has no inverse"):
-        law_function(Adaptive(settings, 0.002, 3))
 
 
 def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:

@@ -17,8 +17,9 @@ from aeroloop.service.control.laws.evaluation import configured_gains, initial_s
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.lab.experiment import run_experiment
-from tests.service.control.laws.test_baselines import BODY, product, unit
+from tests.service.control.laws.test_baselines import BODY, unit
 from tests.support import numpy_twin as twin
+from tests.support.adversary_loop import times as product
 from tests.support.numpy_twin import Array
 
 PERIOD, WIDTH = 0.002, 0.5
@@ -127,22 +128,3 @@ def test_it_learns_friction_and_wind_of_a_body_that_it_models() -> None:
     assert learned["torque_estimate"] == pytest.approx(settings.plant.wind.torque, abs=0.0005)
     assert learned["damping_estimate"] == pytest.approx((0.01, 0.0070, 0.0095), abs=0.001)
     assert learned["coulomb_estimate"] == pytest.approx(friction.coulomb, abs=0.0003)
-
-
-def test_where_a_motor_saturates_the_torque_gives_way_and_no_friction_is_learned() -> None:
-    """A body that is held turned, by hand, for 20 s; a gain of 0 learns nothing at all."""
-    q, omega, still = np.array([np.sqrt(1 - 2 * 0.18**2), 0, 0.18, 0.18]), np.array([0, 0.1, 0.1]), np.zeros(3)
-    B = ((0.005, 0, 0), (0, 0.005, 0), (0, 0, 0.005))
-
-    def held(gain: float, reset_time: float) -> float:
-        """Estimate of the torque in the end [N·m]."""
-        fields = {"allocation": B, "centre_of_mass": still, "Gamma_torque": [gain] * 3, "reset_time": [reset_time] * 3}
-        tick = Tick(AdaptiveTorqueSettings.model_validate(fields), 0.02)
-        state = tick.first
-        for _ in range(1000):
-            state = tick(state, q, omega, np.array([1.0, 0, 0, 0]), still, still)[1]
-        assert state[4:].tolist() == tick.first[4:].tolist()
-        return float(np.abs(state[2:4]).max())
-
-    assert (held(0.2, 1e9), held(0.0, 0.2)) == (AdaptiveTorqueSettings().torque_bound[2], 0.0)
-    assert held(0.2, 0.2) < 0.02
