@@ -194,7 +194,7 @@ class OwnPlant(Plant):
         return Measurement((w, x, y, z), (a, b, c))
 
     def truth(self) -> State | None:
-        """The true state; None where the plant knows none."""
+        """The true state; None where the plant has none to give, such as hardware."""
         true = self._call(self._plant.truth)
         if true is None:
             return None

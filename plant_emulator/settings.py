@@ -143,7 +143,7 @@ class PlantSettings(BaseModel, extra="forbid"):
 
     @property
     def actuators(self) -> int | None:
-        """Number of motors of an emulated body; None for any other plant, whose class knows."""
+        """Number of motors of an emulated body; None for any other plant, whose class states it."""
         return {"aero": 2, "rigid_body": 3}.get(self.kind)
 
     def mechanism(self) -> Mechanism:

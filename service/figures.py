@@ -51,7 +51,7 @@ class Figures(BaseModel):
     skipped_ticks: int | None = Field(description="ticks without a command, whatever the reason")
     latency_us: Percentiles | None
     log: str | None
-    trips: list[str] = Field(default_factory=list, description="why the plant went to 0 V by itself, each time")
+    trips: list[str] = Field(default_factory=list, description="why the plant tripped to 0 V, each time")
     damages: list[str] = Field(default_factory=list, description="unreadable parts of the log")
     reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null, or of a part only")
 

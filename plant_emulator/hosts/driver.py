@@ -270,7 +270,7 @@ class Driver:
         return self.faulty.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
 
     def truth(self) -> Truth | None:
-        """The present true state, with the tick of the measurement taken of it; None where the plant knows none."""
+        """The present true state, with the tick of the measurement taken of it; None where the plant has none."""
         state, endpoint = self.faulty.plant.truth(), self.endpoint
         return state and Truth(
             tick=endpoint.ticked,

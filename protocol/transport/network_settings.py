@@ -19,7 +19,7 @@ from aeroloop.protocol.transport.certificate import Certificate, own_certificate
 from aeroloop.protocol.transport.endpoint import TLS, Endpoint
 
 PORTS: Final = 8
-"""Consecutive ports from each rendezvous' port on that processes meet at: one that hangs keeps nobody out."""
+"""Consecutive ports from each rendezvous' port on that processes meet at: one that hangs keeps none out."""
 
 
 class NetworkError(AeroloopError):

@@ -148,7 +148,7 @@ _MESSAGES: Final[dict[Action, tuple[str, ...]]] = {
     "hold": ("liveliness_token",),
     "watch": ("liveliness_query", "declare_liveliness_subscriber"),
 }
-"""Zenoh's messages by action. `delete` is nobody's."""
+"""Zenoh's messages by action. `delete` is allowed to no role."""
 
 
 def access_control(*vehicles: str, loopback: bool = True) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
     target = target_of(config, overrides)
     from aeroloop.service.terminal.monitor import watch
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which gives the terminal back, as ^C does
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which restores the terminal, as ^C does
     watch(target.network)
 
 

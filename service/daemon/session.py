@@ -12,10 +12,12 @@ import secrets
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from threading import Thread
 from typing import Final
 
+import zenoh
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics

@@ -1,1 +1,1 @@
-"""Operator commands, host checks, systemd units and the payload rate."""
+"""Operator commands, host checks, systemd units, and keys of several hosts."""

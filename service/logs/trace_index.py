@@ -106,7 +106,7 @@ class TraceIndex:
         """Put batches in order, without those that no process of the session publishes.
 
         Those overlap others; or more rows of the session, of the same end, are of another process: a process claims a
-        session or grants it, so batches of its name and of another process are a stranger's.
+        session or grants it, so batches of its name and of another process are untrusted.
         """
         rows: defaultdict[tuple[str, End, str], Counter[Source]] = defaultdict(Counter)
         kept = dict[Source, list[Entry]]()

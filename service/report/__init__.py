@@ -1,1 +1,1 @@
-"""Rendering of a review: an HTML page, PNG figures, and rows of figures of merit."""
+"""Rendering of a review: an HTML page, figures for a paper, and rows of figures of merit."""

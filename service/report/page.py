@@ -79,7 +79,7 @@ def verdict(run: Findings) -> tuple[str, bool | None, str]:
         found = "Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered")
     elif run.trips:
         times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
-        found = "Tripped", False, f"The plant went to 0 V by itself {times}."
+        found = "Tripped", False, f"The plant tripped to 0 V {times}."
     elif troubles or run.faults:
         found = "Faults", None, "No trip; faults, losses and refusals are listed below."
     else:

@@ -77,7 +77,7 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
                     raise ValueError
                 if address.vehicle == which[0]:
                     published.append((at_ns, address.role or "recorder", message))
-        except ValueError:  # a stranger may publish anything, such as 1e999
+        except ValueError:  # untrusted publishers may send anything, such as 1e999
             malformed[name] += 1
     rows = states.rows(which[1])
     truths = Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8], states.signals(which[1]))

@@ -1,6 +1,6 @@
 """Certificate: what is proven of a configuration, with its assumptions, and what fails.
 
-Of every law that `feedback` knows: a bound of the error at every instant, by `invariant`, for the paper's body and for
+For every law in `feedback`: a bound of the error at every instant, by `invariant`, for the paper's body and for
 the configured plant. The certificate holds if the plant's set is proven and lies within all that the proof presumes:
 the wire's ranges, the voltages within reach, half a turn, the bound of the damping. Of the paper's law also condition
 (C.66) with its terms, by `bounds`: a law in continuous time, so nothing of a sampled loop is concluded from it.

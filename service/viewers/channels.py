@@ -130,7 +130,7 @@ class Decoder:
                 return []
             message = topic.model.model_validate_json(payload)
             return _encoded(vehicle, _converted(message, address, wire, published_ns), published_ns)
-        except (ValueError, OverflowError, MessageError):  # a stranger may publish anything, such as 1e999
+        except (ValueError, OverflowError, MessageError):  # untrusted publishers may send anything, such as 1e999
             self.malformed += 1
             return []
 

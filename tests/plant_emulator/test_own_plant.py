@@ -1,26 +1,33 @@
-"""A plant of one's own: found by name, made with its settings, watched over."""
+"""A plant of one's own: found by name, watched over, behind the loop with any number of motors, and replayed."""
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable, Iterator
+from math import sin
+from threading import Event
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.trace import PlantReplay, why_not
 from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
+from tests.support.own_laws import Node, cycle
 from tests.support.own_plants import Turntable, TurntableSettings
+from tests.support.plant_stage import Stage
 
 HERE = "tests.support.own_plants"
 TABLE = f"{HERE}:Turntable"
 PERIOD = 0.002
-
-
-def settings_of(kind: str, **own: Any) -> PlantSettings:
-    return PlantSettings(kind=kind, own=own)
+TICKS = 60
 
 
 def table(**own: Any) -> tuple[OwnPlant, Turntable]:
@@ -28,74 +35,32 @@ def table(**own: Any) -> tuple[OwnPlant, Turntable]:
     return OwnPlant(inner, 24.0), inner
 
 
-def test_a_class_is_made_with_its_own_settings_and_the_period() -> None:
-    made, (alike, _), (other, _) = settings_of(TABLE, inertia=0.5).make(PERIOD), table(inertia=0.5), table()
-    for plant in (made, alike, other):
-        plant.actuate((5.0,))
-        plant.advance()
-    assert made.measure() == alike.measure() != other.measure()
+# ── what is no plant, and what a plant may not do ──
 
 
 @pytest.mark.parametrize(
     ("kind", "own", "line"),
     [
         ("areo", {}, "plant.kind = 'areo' is not known: it is one of aero, fmu, mujoco, rigid_body, or package"),
-        ("nowhere:Table", {}, "there is no module nowhere here"),
         (f"{HERE}:Tabel", {}, "has no Tabel; its classes of aeroloop.Plant are Turntable, "),
         (f"{HERE}:NoPlant", {}, "does not derive from aeroloop.Plant"),
-        (f"{HERE}:Unfinished", {}, "Unfinished"),
         (TABLE, {"inertai": 1}, "unknown key plant.own.inertai: did you mean plant.own.inertia?"),
-        (TABLE, {"inertia": -1}, "plant.own.inertia: should be greater than 0, not -1"),
         (TABLE, {"fails_in": "__init__"}, "Turntable (plant.kind) raised RuntimeError: no such table (own_plants.py"),
-        (
-            f"{HERE}:Legless",
-            {},
-            "Legless has actuators = 0, which must be a whole number from 1 to 8 (own_plants.py, line ",
-        ),
+        (f"{HERE}:Legless", {}, "Legless has actuators = 0, which must be a whole number from 1 to 8 (own_plants.py"),
     ],
 )
 def test_what_is_no_plant_is_one_line(kind: str, own: dict[str, Any], line: str) -> None:
     with pytest.raises(AeroloopError) as caught:
-        settings_of(kind, **own).make(PERIOD)
+        PlantSettings(kind=kind, own=own).make(PERIOD)
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("method", ["actuate", "advance", "measure", "truth", "close"])
-def test_its_own_exception_is_one_line_with_class_file_and_line(method: str) -> None:
-    plant, _ = table(fails_in=method, fails_after=0)
-    with pytest.raises(PlantError) as caught:
-        plant.actuate((1.0,)) if method == "actuate" else getattr(plant, method)()
-    text = f"Turntable failed in {method}(): RuntimeError: the table broke in {method} (own_plants.py, line "
-    assert str(caught.value).startswith(text)
-
-
-@pytest.mark.parametrize(
-    "signals",
-    [
-        {"two words": 1.0},
-        {"": 1.0},
-        {"α_rad": 1.0},
-        {"a" * 41: 1.0},
-        {"state": "off"},
-        [1.0],
-        {f"n{i}": i for i in range(17)},
-    ],
-)
+@pytest.mark.parametrize("signals", [{"two words": 1.0}, {"state": "off"}, {f"n{i}": i for i in range(17)}])
 def test_signals_that_no_log_would_hold_are_refused(signals: Any) -> None:
     plant, _ = table(signals=signals)
     with pytest.raises(PlantError, match=r"Turntable gave .*: truth\(\) must return State"):
         plant.truth()
-
-
-def test_after_a_failure_it_is_closed_once_and_the_first_failure_stays_the_one_shown() -> None:
-    plant, inner = table(fails_in="close", fails_after=0, gives="few")
-    plant.advance()
-    with pytest.raises(PlantError):
-        plant.measure()
-    plant.close()
-    plant.close()
-    assert inner.closed == 1
 
 
 @pytest.mark.parametrize(
@@ -106,13 +71,16 @@ def test_after_a_failure_it_is_closed_once_and_the_first_failure_stays_the_one_s
         ("long", "Turntable measured an attitude of length 2, not a unit quaternion"),
     ],
 )
-def test_what_is_no_measurement_is_one_line(gives: str, line: str) -> None:
-    plant, _ = table(gives=gives, fails_after=0)
+def test_what_is_no_measurement_is_one_line_and_it_is_closed_once(gives: str, line: str) -> None:
+    plant, inner = table(fails_in="close", gives=gives, fails_after=0)
     plant.advance()
     with pytest.raises(PlantError) as caught:
         plant.measure()
     assert line in str(caught.value)
     assert "(own_plants.py, line " in str(caught.value)
+    plant.close()
+    plant.close()
+    assert inner.closed == 1
 
 
 @given(volts=st.floats(allow_nan=False), limit=st.floats(min_value=0.1, max_value=100))
@@ -138,3 +106,131 @@ def test_a_setting_that_would_not_act_is_refused(words: list[str], line: str) ->
 def test_only_the_process_that_runs_it_needs_its_class() -> None:
     settings = load(None, ["plant.kind=nowhere:Table", "plant.own.anything.nested=1"])
     assert settings.plant.own == {"anything": {"nested": 1}}
+
+
+# ── behind the loop ──
+
+
+def stage_of(
+    kind: str, wire: WireSpec, own: dict[str, Any] | None = None, faults: list[str] | None = None, *, lockstep: bool
+) -> Stage:
+    """An emulator with a plant of one's own, whose every measurement is answered at once with rising and falling u."""
+    loop = LoopSettings(lockstep=lockstep, realtime="off")
+    count = iter(range(TICKS * 10))
+
+    def answer(stage: Stage, frame: bytes) -> None:
+        stage.command(frame, [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)])
+
+    def between(stage: Stage) -> None:
+        if stage.endpoint.session is None and stage.endpoint.ticked < 0:  # once
+            stage.claim()
+
+    plant = PlantSettings(kind=f"{HERE}:{kind}", own=own or {}, faults=faults or [])
+    return Stage(loop, wire, plant, between=between, answer=answer)
+
+
+@pytest.mark.parametrize(("kind", "actuators", "lockstep"), [("Turntable", 1, False), ("Octoturntable", 8, True)])
+def test_one_motor_or_eight_are_driven_and_replayed_byte_for_byte(kind: str, actuators: int, lockstep: bool) -> None:
+    wire, own = WireSpec(actuators=actuators), {"inertia": 0.01}
+    faults = [f"motor{actuators}:stuck@0.02..0.05", "rate.z:noise=0.05@0.03", "attitude:bias=0.1@0.02..0.06"]
+    stage = stage_of(kind, wire, own, faults, lockstep=lockstep).run(TICKS)
+    assert stage.endpoint.accepted > TICKS / 2
+    assert sum(fault.changed for fault in stage.driver.fault_statuses()) > 0
+    replay = PlantReplay(stage.loop, wire, PlantSettings(kind=f"{HERE}:{kind}", own=own, faults=faults))
+    for batch in stage.batches:
+        assert batch.columns["voltages"].shape[1:] == (actuators,)
+        replay.feed(batch)
+    found = replay.result()
+    assert (found.differ, found.stopped) == (0, None)
+    assert found.ticks > TICKS / 2
+
+
+@pytest.mark.parametrize(("method", "lockstep"), [("actuate", False), ("advance", True), ("measure", False)])
+def test_a_plant_that_fails_trips_is_closed_at_0_v_and_ends_the_loop(method: str, lockstep: bool) -> None:
+    stage = stage_of("Turntable", WireSpec(actuators=1), {"fails_in": method, "fails_after": 30}, lockstep=lockstep)
+    with pytest.raises(PlantError, match=f"Turntable failed in {method}"):
+        stage.run(TICKS)
+    assert (stage.endpoint.state, stage.endpoint.trip) == (PlantState.TRIPPED, TripCause.PLANT)
+    (tripped,) = [notice for notice in stage.endpoint.notices if notice.kind == "tripped"]
+    assert f"Turntable failed in {method}(): RuntimeError: the table broke in {method} (own_plants.py" in tripped.text
+    assert tripped.session == "s1"
+    assert (Turntable.latest.closed, Turntable.latest.volts) == (1, (0.0,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "wire", "faults", "line"),
+    [
+        ("Octoturntable", WireSpec(), [], "wire.actuators is 2, but the plant has 8 actuators"),
+        ("Turntable", WireSpec(actuators=1), ["motor2:off"], "the plant has no motor2, but motor1"),
+    ],
+)
+def test_a_plant_that_does_not_fit_is_refused_and_closed(
+    kind: str, wire: WireSpec, faults: list[str], line: str
+) -> None:
+    with pytest.raises(ValueError, match=line):
+        stage_of(kind, wire, faults=faults, lockstep=False)
+    assert (type(Turntable.latest).__name__, Turntable.latest.closed) == (kind, 1)
+
+
+@pytest.mark.parametrize(
+    ("plant", "why"),
+    [
+        ({"kind": f"{HERE}:Hardware"}, "Hardware (plant.kind) does not state that it is `repeatable`"),
+        ({"kind": f"{HERE}:Gone"}, "has no Gone"),
+        ({"via": "quanser"}, "plant.via is 'quanser'"),
+    ],
+)
+def test_a_machine_is_not_moved_by_a_replay(plant: dict[str, Any], why: str) -> None:
+    settings = PlantSettings(**plant)
+    assert why in (why_not(settings) or "")
+    with pytest.raises(ValueError, match=r"plant\."):
+        PlantReplay(LoopSettings(), WireSpec(), settings)
+
+
+def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Turntable, "paces", True)
+    advance: Callable[[Turntable], None] = Turntable.advance
+    count = iter(range(TICKS + 1))
+
+    def late(self: Turntable) -> None:
+        advance(self)
+        self.passed = 3 if next(count) == 10 else 1
+
+    monkeypatch.setattr(Turntable, "advance", late)
+    assert stage_of("Turntable", WireSpec(actuators=1), lockstep=False).run(TICKS).skipped == 2
+
+
+class Cyclic(Turntable):
+    """Makes two objects a tick that refer to each other."""
+
+    def advance(self) -> None:
+        super().advance()
+        cycle()
+
+
+@pytest.fixture
+def _collector_off() -> Iterator[None]:
+    """As `prepare_process` leaves it."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+@pytest.mark.usefixtures("_collector_off")
+def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_without() -> None:
+    loop, wire, settings = LoopSettings(realtime="off"), WireSpec(actuators=1), PlantSettings(watchdog_s=10)
+    driver = Driver(Cyclic(TurntableSettings(), loop.period), loop, wire, settings, stop := Event())
+
+    def between(stage: Stage) -> None:
+        if stage.endpoint.ticked == 3000:
+            stage.claim()
+
+    stage = Stage(loop, wire, settings, driver=driver, between=between)
+    stage.stop = stop
+    before = Node.alive
+    stage.run(6000)
+    assert len(stage.wires.sent) > 200  # until no first command came
+    assert Node.alive - before < 2_000  # of 12 000

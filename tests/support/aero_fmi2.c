@@ -54,10 +54,10 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real length, fmi2Boole
   Aero* aero = c;
   double* v = aero->v;
   if (aero->calls != 3) return fmi2Error;
-  if (time >= v[FAILS_AT] || fabs(length - PERIOD) > 1e-9) {
-    fmi2Status status = time >= v[FAILS_AT] ? (fmi2Status)v[FAILS_WITH] : fmi2Error;
-    aero->callbacks->logger(0, "aero", status, "error", status == fmi2Error && time < v[FAILS_AT]
-                            ? "no step but %g s" : "the motor burnt at %g s", time < v[FAILS_AT] ? PERIOD : time);
+  if (fabs(length - PERIOD) > 1e-9) return fmi2Error;
+  if (time >= v[FAILS_AT]) {
+    fmi2Status status = (fmi2Status)v[FAILS_WITH];
+    aero->callbacks->logger(0, "aero", status, "error", "the motor burnt at %g s", time);
     return status;
   }
   double after[4];

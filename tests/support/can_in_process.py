@@ -59,21 +59,6 @@ class Stranger:
             if wanted(message):
                 return message
 
-    def heartbeat(self, state: PlantState) -> Heartbeat:
-        """The node's next heartbeat that says this state; the others are thrown away."""
-        beat: Heartbeat | None = None
-
-        def says(message: can.Message) -> bool:
-            nonlocal beat
-            if message.arbitration_id != PLANT_HEARTBEAT_ID + self._node:
-                return False
-            beat = Heartbeat.unpack(bytes(message.data), 0)
-            return beat is not None and beat.state is state
-
-        self.receive(says)
-        assert beat is not None
-        return beat
-
     def everything(self) -> list[can.Message]:
         return list(iter(lambda: self._bus.recv(0), None))
 
@@ -91,7 +76,7 @@ class Flaws:
 
     def __init__(self) -> None:
         self.full = self.lost = self.gone = False
-        self.opened = self.closed = self.sent = 0
+        self.opened = self.sent = 0
 
     def bus(self, channel: str, **options: Any) -> FlawedBus:
         """As `can.Bus`, of the virtual interface."""
@@ -115,10 +100,6 @@ class FlawedBus(VirtualBus):
         if self._flaws.full:
             raise can.CanOperationError("transmit queue is full")
         super().send(msg, timeout)
-
-    def shutdown(self) -> None:
-        self._flaws.closed += 1
-        super().shutdown()
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if self._flaws.lost:

@@ -6,9 +6,8 @@ might: a watchdog that has not expired refuses to be cleared, and clearing an ex
 the expiry. A wrong use raises MisuseError, which no code treats as a failure of the board.
 
 The board's time is a count of samples. With `realtime` samples fall due on an absolute grid, read or not; without,
-`task_read` lets the next period pass at once. No time passes before the task is started. Not emulated: rotor encoders,
-accelerometer, tachometers and currents, which read 0; more than one task, or a buffer of more than one sample; writer
-tasks, PWM and digital inputs, lights; a clear that fails permanently.
+`task_read` lets the next period pass at once. No time passes before the task is started. Emulated is what the plant
+uses: two motors, encoders and gyro, one reader task with a buffer of one sample.
 
 `quanser_sdk/` beside this file is the package `quanser` with this board in it, for processes that tests start.
 """
@@ -30,8 +29,7 @@ from aeroloop.plant_emulator.plant import State
 from aeroloop.plant_emulator.settings import PlantSettings
 
 _ENCODERS: Final = range(4)
-_OTHER_INPUTS: Final = (*range(3000, 3003), *range(4000, 4003), *range(14000, 14004))
-_CALLS_KEPT: Final = 10_000
+_GYRO: Final = range(3000, 3003)
 
 Kind = Literal["analog", "digital"]
 
@@ -81,8 +79,7 @@ class Task:
 class FakeQuanser:
     """A board with an emulated Aero on it, and the names of the module `quanser.hardware`.
 
-    Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started. The
-    documentation is silent on whether reads succeed after the watchdog has expired (`reads_while_expired`).
+    Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started.
     """
 
     HILError = HILError
@@ -94,8 +91,7 @@ class FakeQuanser:
     ) -> None:
         self.HIL: Callable[[], FakeHIL] = lambda: FakeHIL(self)
         self.card_type, self.period, self.realtime = card_type, period, realtime
-        self.calls: deque[str] = deque(maxlen=_CALLS_KEPT)
-        self.reads_while_expired = True
+        self.calls: deque[str] = deque(maxlen=10_000)  # names of the last calls
         self._turns = COUNTS[card_type]
         sensors = {"attitude": "encoders", "counts": self._turns, "rate": "gyro"}
         sensing = settings.sensors.model_copy(update=sensors)
@@ -137,6 +133,7 @@ class FakeQuanser:
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
+        """Let periods pass in which nobody reads."""
         for _ in range(periods):
             self.step()
 
@@ -168,7 +165,7 @@ class FakeQuanser:
     def sample(self, encoders: Sequence[int], other: Sequence[int]) -> tuple[list[int], list[float]]:
         counts = [self._raw[channel] - self._zeros[channel] for channel in encoders]
         gyro = self._plant.measure().rate
-        return counts, [gyro[channel - 3000] if channel in range(3000, 3003) else 0.0 for channel in other]
+        return counts, [gyro[channel - _GYRO.start] for channel in other]
 
     def called(self, name: str) -> None:
         """Record a call and fail it if a test requested that. Samples due by now are taken first."""
@@ -220,8 +217,6 @@ class FakeHIL:
     def open(self, card_type: str, card_identifier: str, /) -> None:
         device = self._device
         device.called("open")
-        strings = isinstance(card_type, str) and isinstance(card_identifier, str)
-        _require(strings, "a board is named by two strings")
         there = card_type == device.card_type and card_identifier == "0"
         _refuse(not there, f"there is no {card_type} '{card_identifier}'")
         _require(device.holder is not self, "open is called twice")
@@ -314,8 +309,6 @@ class FakeHIL:
         _require(task.running, "a task is read that was not started")
         _require(samples == 1, f"one sample makes a period, not {samples}")
         _check_buffers(task.encoders, task.other, *buffers)
-        if failure is None and device.expired and not device.reads_while_expired:
-            failure = HILError("the watchdog has expired")
         if failure is None or not device.realtime:  # by the clock, the sample falls due whether the read fails or not
             device.wait()
             sample = task.samples.popleft()
@@ -420,14 +413,13 @@ def _numbers(channels: Any, n: int, there: Sequence[int]) -> list[int]:
     return numbers
 
 
-def _array(array: Any, dtype: type[np.generic], n: int, *, writeable: bool = False) -> None:
+def _array(array: Any, dtype: type[np.generic], n: int) -> None:
     """Check an array for C, which would misread another type and read past the end of a shorter one."""
     if array is None and n == 0:
         return
     fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == (n,)
     _require(fits, f"an array of {n} {dtype.__name__} is required, not {array!r}")
-    usable = array.flags.c_contiguous and (array.flags.writeable or not writeable)
-    _require(usable, "C needs an array that is contiguous, and writeable if it is read into")
+    _require(array.flags.c_contiguous, "C needs an array that is contiguous")
 
 
 def _inputs(
@@ -436,13 +428,13 @@ def _inputs(
     """Numbers of the encoder and the other channels to read."""
     unread = analog is None and not n_analog and digital is None and not n_digital
     _require(unread, "the fake reads encoders and other channels only")
-    return _numbers(encoders, n_encoders, _ENCODERS), _numbers(other, n_other, _OTHER_INPUTS)
+    return _numbers(encoders, n_encoders, _ENCODERS), _numbers(other, n_other, _GYRO)
 
 
 def _check_buffers(encoders: list[int], others: list[int], analog: Any, counts: Any, digital: Any, other: Any) -> None:
     _require(analog is None and digital is None, "a buffer without channels")
-    _array(counts, np.int32, len(encoders), writeable=True)
-    _array(other, np.float64, len(others), writeable=True)
+    _array(counts, np.int32, len(encoders))
+    _array(other, np.float64, len(others))
 
 
 def _fill(sample: tuple[list[int], list[float]], _: None, counts: Any, __: None, other: Any) -> None:

@@ -19,8 +19,7 @@ class TurntableSettings(BaseModel, extra="forbid"):
     inertia: float = Field(default=0.02, gt=0, description="about z [kg·m²]")
     fails_in: Literal["", "__init__", "actuate", "advance", "measure", "truth", "close"] = ""
     fails_after: int = Field(default=3, description="periods before it fails")
-    gives: Literal["values", "nan", "few", "long", "nothing"] = "values"
-    says: Any = None
+    gives: Literal["values", "few", "long", "nothing"] = "values"
     signals: Any = None
 
 
@@ -57,8 +56,6 @@ class Turntable(Plant):
         self._may("measure")
         half, rate = self._angle / 2, (0.0, 0.0, self._rate)
         gives = self._own.gives if self._ticks > self._own.fails_after else "values"
-        if gives == "nan":
-            return Measurement((nan, nan, nan, nan), rate)
         if gives == "few":
             return Measurement((cos(half), 0.0, 0.0), rate)  # type: ignore[arg-type]  # that is the point
         if gives == "nothing":
@@ -107,10 +104,6 @@ class Legless(Turntable):
     """Has no motors."""
 
     actuators = 0
-
-
-class Unfinished(Plant):
-    """Lacks every method."""
 
 
 class NoPlant:

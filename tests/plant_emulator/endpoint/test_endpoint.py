@@ -43,11 +43,6 @@ from tests.support.plant_end import (
     ("changed", "fields"),
     [
         ({"protocol": 99}, [f"protocol: {PROTOCOL_VERSION}, not 99"]),
-        ({"wire": WIRE.model_copy(update={"rate": SignalSpec(bits=10, limit=1.0)})}, ["rate.bits: 8, not 10"]),
-        (
-            {"wire": WIRE.model_copy(update={"voltage": SignalSpec(bits=6, limit=18)})},
-            ["voltage.limit: 24.0, not 18.0"],
-        ),
         (
             {"wire": WIRE.model_copy(update={"actuators": 3}), "period_ns": 1_000_000, "lockstep": True},
             ["actuators: 2, not 3", "period_ns: 2000000, not 1000000", "lockstep: False, not True"],
@@ -66,23 +61,10 @@ def test_a_claim_that_differs_is_refused_by_the_names_of_the_fields(
     assert (claims.state, claims.session) == (PlantState.IDLE, None)
 
 
-@pytest.mark.parametrize("late", [0, 3])
-def test_time_begins_at_tick_0_and_the_very_first_call_takes_no_command(late: int) -> None:
-    """So that the plant can be computed again from its ticks alone."""
-    plant = RecordingPlant()
-    endpoint = Endpoint(plant, WIRE, PERIOD_NS)
-    endpoint.claim(claim_of())
-    frame = endpoint.tick(command(0), late)
-    assert frame is not None
-    assert WIRE.measurement.counter(frame) == 0
-    assert plant.periods == [OFF] * late
-    assert endpoint.accepted == 0
-
-
 # ── deadlines ──
 
 
-@pytest.mark.parametrize(("watchdog_s", "ticks"), [(0.02, 10), (0.1, 50), (0.5, 250), (1e-6, 1)])
+@pytest.mark.parametrize(("watchdog_s", "ticks"), [(0.1, 50), (1e-6, 1)])
 def test_the_watchdogs_time_can_be_set_and_is_in_the_events_text(watchdog_s: float, ticks: int) -> None:
     plant = RecordingPlant()
     endpoint = Endpoint(plant, WIRE, PERIOD_NS, watchdog_s=watchdog_s)
@@ -129,10 +111,8 @@ MEASUREMENTS = st.lists(
 )
 
 
-@pytest.mark.parametrize("attitude", SIGNALS, ids=lambda signal: f"{signal.kind}-{signal.bits}")
-@pytest.mark.parametrize("rate", SIGNALS, ids=lambda signal: f"{signal.kind}-{signal.bits}")
-@settings(max_examples=25)
-@given(measured=MEASUREMENTS)
+@settings(max_examples=150)
+@given(attitude=st.sampled_from(SIGNALS), rate=st.sampled_from(SIGNALS), measured=MEASUREMENTS)
 def test_codes_are_those_of_a_quantizer_for_each_value_and_a_failed_sensor_makes_all_invalid(
     attitude: SignalSpec, rate: SignalSpec, measured: list[tuple[float, ...]]
 ) -> None:
@@ -193,7 +173,6 @@ def driven(limits: LimitSettings) -> tuple[Endpoint, RecordingPlant]:
     ("within", "beyond", "why"),
     [
         (turned(29.9), turned(30.1), "tilted by 30.1°, more than limits.max_tilt_deg = 30°: 0 V"),
-        (turned(-29.9), turned(-30.1), "tilted by 30.1°, more than limits.max_tilt_deg = 30°: 0 V"),
         (
             Measurement(IDENTITY, (0.0, 3.0, 3.9)),
             Measurement(IDENTITY, (0.0, 3.0, 4.1)),
@@ -262,17 +241,10 @@ def end(request: pytest.FixtureRequest) -> VehicleClaim:
     return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
 
 
-def lost_and_stopped(end: VehicleClaim) -> None:
-    end.lost("a")
-    end.stop()
-
-
 ENDINGS: list[tuple[Callable[[VehicleClaim], object], TripCause | str]] = [
     (lambda end: end.release("of-a"), "released"),
     (lambda end: end.lost("a"), TripCause.HOLDER_GONE),
-    (lambda end: end.expire(TripCause.NO_ANSWER, "no answer"), TripCause.NO_ANSWER),
     (lambda end: end.stop(), TripCause.OPERATOR),
-    (lost_and_stopped, TripCause.OPERATOR),
 ]
 
 

@@ -8,9 +8,7 @@ from itertools import accumulate
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -41,13 +39,6 @@ def rows(batches: list[Batch], column: str) -> list[object]:
 
 def operations(batches: list[Batch]) -> list[PlantChange]:
     return [operation for batch in batches for operation in batch.tail.operations]
-
-
-def inject(text: str) -> Callable[[Stage], None]:
-    def do(stage: Stage) -> None:
-        stage.driver.inject([Fault.parse(text)])
-
-    return do
 
 
 def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_took() -> None:
@@ -102,38 +93,9 @@ def test_a_row_holds_what_came_what_was_made_of_it_and_what_was_measured() -> No
 
 
 @pytest.mark.parametrize(
-    ("meddle", "cause"),
-    [
-        (inject("attitude:off"), TripCause.SENSORS),
-        (inject("command:off"), TripCause.COMMAND_TIMEOUT),
-        (lambda stage: stage.wires.deliver(WIRE.command.pack(40, (-32, 0)), 1_000), None),
-        (
-            lambda stage: stage.wires.deliver(WIRE.command.pack(stage.endpoint.counter, (-32, 0)), 0),
-            TripCause.INVALID_COMMAND,
-        ),
-    ],
-    ids=["sensors", "commands lost", "none", "invalid"],
-)
-def test_a_trip_is_the_sessions_last_row_with_its_cause(
-    meddle: Callable[[Stage], None], cause: TripCause | None
-) -> None:
-    batches = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim, 40: meddle}), answer=answer).run(200).batches
-    *before, last = rows(batches, "trip")
-    assert set(before) == {0}
-    assert last == (0 if cause is None else cause.number)
-    assert rows(batches, "sent_as")[-1] == (Sent.FRAME if cause is None else Sent.NONE)
-    assert batches[-1].header.final
-    if cause is not None:
-        assert len(before) < 190
-        assert tuple(batches[-1].columns["voltages"][-1]) == OFF
-        assert rows(batches, "answered")[-1] == 0xFFFF_FFFF
-
-
-@pytest.mark.parametrize(
     ("frame", "received_as", "outcome"),
     [
         (WIRE.command.pack(38, (3, -3)) + b"\0", Sent.MALFORMED, Outcome.MALFORMED),  # the rest would be fresh
-        (b"\1", Sent.MALFORMED, Outcome.MALFORMED),
         (UNCHANGED, Sent.SILENT, Outcome.MALFORMED),
         (b"\xff" * WIRE.command.size, Sent.FRAME, Outcome.MALFORMED),
         (WIRE.command.pack(3, (31, 31)), Sent.FRAME, Outcome.REPEATED),
@@ -147,30 +109,3 @@ def test_what_is_not_acted_upon_is_in_its_row(frame: bytes, received_as: Sent, o
     assert rows(batches, "outcome")[row] == outcome
     if received_as is Sent.FRAME:
         assert b"".join(b.columns["command"].tobytes() for b in batches)[row * len(frame) :][: len(frame)] == frame
-
-
-def test_commands_that_a_fault_keeps_back_are_withheld_and_in_their_rows() -> None:
-    between = at({0: Stage.claim, 40: inject("command:off@0..0.02")})
-    batches = Stage(LOOP, WIRE, PLANT, between=between, answer=answer).run(60).batches
-    first = rows(batches, "tick").index(41)
-    assert rows(batches, "outcome")[first - 1 : first + 11] == [Outcome.ACTED, *[Outcome.WITHHELD] * 10, Outcome.ACTED]
-    assert set(rows(batches, "received_as")[first:]) == {Sent.FRAME}
-    assert operations(batches)[-1] == PlantChange(tick=40, kind="inject", name="command:off@0..0.02")
-
-
-def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:
-    loop = LoopSettings(lockstep=True, realtime="off")
-
-    def sometimes(stage: Stage, measurement: bytes) -> None:
-        if stage.endpoint.ticked != 20:
-            answer(stage, measurement)
-
-    def claim(stage: Stage) -> None:
-        if stage.endpoint.session is None:
-            stage.claim()
-
-    batches = Stage(loop, WIRE, PLANT, between=claim, answer=sometimes).run(40).batches
-    assert rows(batches, "tick") == list(range(41))
-    expired = operations(batches)[1]
-    assert (expired.kind, expired.tick, expired.cause) == ("expire", 20, TripCause.NO_ANSWER)
-    assert rows(batches, "session_tick") == [*range(21), *range(20)]

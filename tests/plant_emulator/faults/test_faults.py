@@ -90,19 +90,11 @@ def missing(values: Sequence[float]) -> bool:
         ("altitude:off", "no signal 'altitude'", "attitude, attitude.x"),
         ("attitude:of", "takes no 'of'", "off, stuck, bias, noise, delay, drop and garble"),
         ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise and drop; attitude as a whole does"),
-        ("command:bias=1", "command takes no 'bias'", "off, stuck, delay, drop, garble, duplicate and reorder"),
         ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
         ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
-        ("attitude.x:bias=-3.2", "not -3.2", "-3.1416 to 3.1416 rad"),
-        ("motors:bias=1e308", "not 1e+308", "-48 to 48 V"),
-        ("rate:noise=-1", "not -1", "0 to 35 rad/s"),
-        ("rate:delay=10.5", "not 10.5", "0 to 10 s"),
         ("rate:drop=0", "not 0", "a probability above 0 and up to 1"),
         ("rate:bias=much", "'much' is not a number", ""),
-        ("rate:off@soon", "'soon' is not a number", ""),
-        ("rate:off@nan", "not at nan s", "within 0 to 1e+08 s"),
         ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
-        ("rate:off@4..1e9", "not at 1000000000 s", "by 1e+08 s"),
         ("rate:off\n@1", "takes no 'off\\n'", "off, stuck"),
     ],
 )
@@ -167,15 +159,11 @@ def between(k: int, start: int, end: int = 100) -> bool:
         (["rate.y:off@0.3..0.6"], lambda k, true: GONE if between(k, 3, 6) else true(k)),
         (["rate:stuck"], lambda _, true: true(0)),
         (["rate.y:stuck@0.3..0.6"], lambda k, _: (k, 20 if between(k, 3, 6) else 10 * k, 100 * k)),
-        (["rate:bias=0"], lambda k, true: true(k)),
         (["rate.y:bias=0.5@0.3"], lambda k, _: (k, 10 * k + 0.5 * between(k, 3), 100 * k)),
-        (["rate:bias=-2@0.6"], lambda k, true: tuple(x - 2 * between(k, 6) for x in true(k))),
-        (["rate:delay=0"], lambda k, true: true(k)),
         (["rate:delay=0.05"], lambda k, true: true(max(0, k - 1))),  # what was true at the beginning of a period
         (["rate.x:delay=0.2@0.4..0.7"], lambda k, _: (k - 2 * between(k, 4, 7), 10 * k, 100 * k)),
         (["rate:drop=1"], lambda *_: GONE),
         (["rate:bias=1@0.3", "rate:stuck@0.3"], lambda k, true: true(min(k, 2))),  # one after another, in this order
-        (["rate:stuck@0.3", "rate:bias=1@0.3"], lambda k, true: tuple(x + between(k, 3) for x in true(min(k, 2)))),
     ],
 )
 def test_a_rate_fails_as_written_and_the_attitude_does_not(
@@ -188,33 +176,7 @@ def test_a_rate_fails_as_written_and_the_attitude_does_not(
     assert [m.attitude for m in seen] == [sample(k).attitude for k in range(9)]
 
 
-@pytest.mark.parametrize(
-    ("fault", "reported"),
-    [
-        ("attitude:off@0.3..0.6", lambda k: None if between(k, 3, 6) else k),
-        ("attitude.x:off@0.3..0.6", lambda k: None if between(k, 3, 6) else k),
-        ("attitude:stuck@0.5", lambda k: min(k, 4)),
-        ("attitude:bias=0", lambda k: k),
-        ("attitude:delay=0", lambda k: k),
-        ("attitude:delay=0.3@0.1", lambda k: max(0, k - 3)),  # even from before the fault
-    ],
-)
-def test_an_attitude_fails_as_written_and_the_rate_does_not(fault: str, reported: Callable[[int], int | None]) -> None:
-    for k, m in enumerate(sensed(fault)):
-        of = reported(k)
-        assert missing(m.attitude) if of is None else m.attitude == sample(of).attitude
-        assert m.rate == sample(k).rate
-
-
-@pytest.mark.parametrize(
-    ("signal", "rotation"),
-    [
-        ("attitude.x", (0.3, 0.0, 0.0)),
-        ("attitude.y", (0.0, 0.3, 0.0)),
-        ("attitude.z", (0.0, 0.0, 0.3)),
-        ("attitude", (0.3, 0.3, 0.3)),
-    ],
-)
+@pytest.mark.parametrize(("signal", "rotation"), [("attitude.x", (0.3, 0.0, 0.0)), ("attitude", (0.3, 0.3, 0.3))])
 def test_a_biased_attitude_is_turned_about_the_bodys_axes(signal: str, rotation: Vector) -> None:
     """At k = 7 the body has yawed by 0.14 rad, so that its axes and the inertial ones differ."""
     q = Rotation.from_quat(sample(7).attitude, scalar_first=True) * Rotation.from_rotvec(rotation)
@@ -222,14 +184,10 @@ def test_a_biased_attitude_is_turned_about_the_bodys_axes(signal: str, rotation:
     assert seen.attitude == pytest.approx(q.as_quat(scalar_first=True).tolist(), abs=1e-15)
 
 
-@pytest.mark.parametrize(("signal", "noise"), [("rate.y", 0.2), ("motor2", 0.3)])
-def test_noise_has_the_deviation_it_was_given(signal: str, noise: float) -> None:
+def test_noise_has_the_deviation_it_was_given() -> None:
     """Of n samples, mean and deviation lie within 5 of their standard errors σ/√n and σ/√2n."""
-    fault = f"{signal}:noise={noise}"
-    if signal == "motor2":
-        added = [u[1] + k for k, u in enumerate(driven(fault, ticks=MANY))]
-    else:
-        added = [m.rate[1] - sample(k).rate[1] for k, m in enumerate(sensed(fault, ticks=MANY))]
+    noise = 0.2
+    added = [m.rate[1] - sample(k).rate[1] for k, m in enumerate(sensed(f"rate.y:noise={noise}", ticks=MANY))]
     assert fmean(added) == pytest.approx(0.0, abs=5 * noise / sqrt(MANY))
     assert pstdev(added) == pytest.approx(noise, abs=5 * noise / sqrt(2 * MANY))
 
@@ -243,7 +201,6 @@ def test_noise_has_the_deviation_it_was_given(signal: str, noise: float) -> None
         (["motor2:off@0.3..0.6"], lambda k: (k, 0 if between(k, 3, 6) else -k)),
         (["motors:off@0.3..0.6"], lambda k: (0, 0) if between(k, 3, 6) else (k, -k)),
         (["motor1:stuck@0.3..0.6"], lambda k: (2 if between(k, 3, 6) else k, -k)),
-        (["motors:stuck@0.3"], lambda k: (min(k, 2), -min(k, 2))),
         (["motor1:bias=0.5@0.3", "motors:bias=-1@0.6"], lambda k: (k + 0.5 * (k >= 3) - (k >= 6), -k - (k >= 6))),
         (["motor1:delay=0.2@0.4"], lambda k: (k - 2 if k >= 4 else k, -k)),
         (["motors:delay=0.3"], lambda k: (max(0, k - 3), -max(0, k - 3))),
@@ -262,13 +219,8 @@ def test_a_motor_fails_as_written(faults: list[str], voltages: Callable[[int], t
         ([], ["a", "", "b"], ["a", "", "b"]),
         (["off@0.2..0.4"], "abcdef", ["a", "b", "", "", "e", "f"]),
         (["stuck@0.2..0.5"], ["a", "b", "c", "", "e", "f"], ["a", "b", "b", "", "b", "f"]),
-        (["stuck"], "abc", ["a", "a", "a"]),
-        (["delay=0.2"], "abcde", ["", "", "a", "b", "c"]),
-        (["delay=0.05"], "abc", ["", "a", "b"]),
         (["delay=0.2@0.1..0.4"], "abcdef", ["a", "", "", "b", "cde", "f"]),  # what is on its way comes at once, first
         (["duplicate=1@0.1..0.3"], [*"abcd", ""], ["a", "b", "bc", "cd", ""]),
-        (["duplicate=1"], ["a", "", ""], ["a", "a", ""]),
-        (["reorder=1"], "abcd", ["", "ba", "", "dc"]),
         (["reorder=1@0.1..0.2"], ["a", "b", "", "d", "e"], ["a", "", "", "db", "e"]),
         (["duplicate=1", "delay=0.1"], ["a", "", ""], ["", "a", "a"]),  # one after another, in this order
         (["delay=0.1", "off@0.1"], "abc", ["", "", ""]),
@@ -279,37 +231,16 @@ def test_frames_pass_as_written(faults: list[str], frames: Sequence[str], ticks:
     assert [b"".join(tick).decode() for tick in seen] == ticks
 
 
-@given(delay_ms=st.integers(0, 30), start=st.integers(0, 40), length=st.integers(1, 40))
-def test_every_frame_passes_a_delay_once_and_in_order_and_none_too_late(delay_ms: int, start: int, length: int) -> None:
-    text = f"command:delay={delay_ms / 1000}@{start / 1000}..{(start + length) / 1000}"
-    frames = numbered(60)
-    ticks = passed(text, frames=[*frames, *[None] * 60], period=0.001)
-    assert list(chain(*ticks)) == frames
-    for k, tick in enumerate(ticks):
-        for frame in tick:
-            sent = int.from_bytes(frame, "big")
-            due = sent + delay_ms if start <= sent < start + length else sent
-            assert k == min(due, max(sent, start + length))
-
-
-@pytest.mark.parametrize("kind", ["drop", "garble", "duplicate", "reorder"])
-def test_a_fifth_of_the_frames_fails_and_the_others_pass_as_they_are(kind: str) -> None:
+def test_a_fifth_of_the_frames_is_dropped_and_none_is_lost_by_reordering() -> None:
     """Five binomial deviations of 40. Of n that could be held back, n·p/(1 + p) = 1667 change places."""
     frames = numbered(MANY)
-    ticks = passed(f"command:{kind}=0.2@0..999.9", frames=frames)
-    whole = list(chain(*ticks))
-    if kind == "drop":
-        assert abs(sum(not tick for tick in ticks) - 2000) <= 200
-        assert all(tick in ([], [frame]) for tick, frame in zip(ticks, frames, strict=True))
-    elif kind == "garble":
-        assert abs(sum(tick != [frame] for tick, frame in zip(ticks, frames, strict=True)) - 2000) <= 200
-    elif kind == "duplicate":
-        assert abs(len(whole) - 12_000) <= 200
-        assert sorted(set(whole)) == frames
-    else:
-        assert sorted(whole) == frames  # nothing is lost or repeated
-        assert abs(sum(len(tick) == 2 for tick in ticks) - 1667) <= 200
-        assert all(tick[0] > tick[1] for tick in ticks if len(tick) == 2)
+    dropped = passed("command:drop=0.2@0..999.9", frames=frames)
+    assert abs(sum(not tick for tick in dropped) - 2000) <= 200
+    assert all(tick in ([], [frame]) for tick, frame in zip(dropped, frames, strict=True))
+    reordered = passed("command:reorder=0.2@0..999.9", frames=frames)
+    assert sorted(chain(*reordered)) == frames
+    assert abs(sum(len(tick) == 2 for tick in reordered) - 1667) <= 200
+    assert all(tick[0] > tick[1] for tick in reordered if len(tick) == 2)
 
 
 def test_a_garbled_frame_differs_in_exactly_one_bit_and_in_any() -> None:
@@ -372,10 +303,6 @@ def test_nothing_fails_and_no_time_passes_before_the_start() -> None:
     assert stand.voltages == other.voltages != (0.0, 0.0)  # nor does the wait use up random numbers
     assert stand.voltages[1] == 0.0
     assert missing(plant.measure().rate)
-    plant.advance()
-    plant.start()  # a second call does nothing
-    plant.advance()
-    assert plant.time == 0.2
 
 
 # ── injection ──
@@ -396,16 +323,6 @@ def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
     assert [rate[1] for rate in known] == [10, 20, 30, 30, 30, 30, 30]
     assert [k for k, m in enumerate(seen, 1) if missing(m.rate)] == [5]
     assert [m.attitude for m in seen] == [sample(k).attitude for k in range(1, 9)]
-
-
-def test_motors_fail_and_recover_under_a_held_voltage_and_one_stuck_at_once_keeps_what_it_had() -> None:
-    plant, stand = faulty("motor1:off@0.3..0.6", "motor2:stuck", started=False)
-    plant.actuate((5.0, 4.0))
-    plant.start()
-    plant.actuate((5.0, 9.0))
-    for _ in range(8):
-        plant.advance()
-    assert stand.periods == [(5, 4)] * 3 + [(0, 4)] * 3 + [(5, 4)] * 2
 
 
 def test_of_faults_that_cannot_be_none_is_injected() -> None:
@@ -460,7 +377,7 @@ def test_frames_are_of_one_direction_and_those_held_back_are_lost_with_their_ses
     assert plant.passes("command", b"c") == [b"b"]  # the frame that passed last
 
 
-@pytest.mark.parametrize("fault", ["motors:bias=3", "motors:stuck@0.1", "motors:garble=1", "motors:delay=1"])
+@pytest.mark.parametrize("fault", ["motors:bias=3", "motors:stuck@0.1", "motors:delay=1"])
 def test_it_is_closed_at_no_voltage_whatever_its_faults_even_one_that_comes_too_late(fault: str) -> None:
     plant, stand = faulty(fault)
     for _ in range(3):

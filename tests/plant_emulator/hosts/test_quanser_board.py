@@ -14,7 +14,6 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts import quanser_board
@@ -101,16 +100,6 @@ def is_nothing(seen: Measurement) -> bool:
     return all(isnan(value) for value in (*seen.attitude, *seen.rate))
 
 
-class Calls:
-    """Names of the calls to a board since this was made."""
-
-    def __init__(self, board: FakeQuanser) -> None:
-        self._board, self._before = board, len(board.calls)
-
-    def names(self) -> list[str]:
-        return list(self._board.calls)[self._before :]
-
-
 @pytest.fixture(autouse=True)
 def no_package() -> Iterator[None]:
     """Remove the fake package that a test has put in the place of Quanser's."""
@@ -130,19 +119,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
 CLOSING = ["write_analog", "write_digital", "watchdog_stop", "task_stop", "task_delete", "close"]
 
 
-@pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'quanser'"), OSError("libhil.so not found")])
-def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    def fail(_: str) -> ModuleType:
-        raise error
-
-    monkeypatch.setattr(quanser_board, "import_module", fail)
-    with pytest.raises(QuanserError) as refused:
+def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_install() -> None:
+    with pytest.raises(QuanserError, match=r"No module named 'quanser'.*Quanser SDK.*quanser_api") as refused:
         QuanserPlant(QuanserSettings(), PERIOD, 0.1)
-    text = str(refused.value)
-    assert all(part in text for part in (str(error), "Quanser SDK", "quanser_api"))
-    assert "\n" not in text
+    assert "\n" not in str(refused.value)
 
 
 def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_begins() -> None:
@@ -167,17 +147,9 @@ def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_be
     assert board.task.samples.maxlen == 1
     period = ["task_read", "task_get_buffer_overflows", "watchdog_reload"]
     for expected in (["watchdog_start", "task_start", *period], period):
-        calls = Calls(board)
+        board.calls.clear()
         plant.advance()
-        assert calls.names() == expected
-
-
-def test_the_watchdog_runs_before_the_first_command_is_written_and_the_amplifier_is_on_before_its_voltage() -> None:
-    plant, board = plant_on_board(session=False)
-    calls = Calls(board)
-    plant.amplify(True)
-    assert calls.names() == ["watchdog_start", "task_start", "write_digital", "write_analog"]
-    assert board.watchdog == WATCHDOG
+        assert list(board.calls) == expected
 
 
 def test_a_board_that_was_left_under_an_expired_watchdog_is_had_again_at_0_v() -> None:
@@ -202,49 +174,31 @@ def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None
             plant_of(board, settings)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        "write_analog",
-        "write_digital",
-        "watchdog_set_analog_expiration_state",
-        "watchdog_set_digital_expiration_state",
-        "set_encoder_counts",
-        "read",
-        "task_create_reader",
-        "task_set_buffer_overflow_mode",
-    ],
-)
-def test_a_board_that_cannot_be_made_ready_is_closed(call: str) -> None:
+def test_a_board_that_cannot_be_made_ready_is_closed_and_one_that_cannot_be_started_is_reported() -> None:
     board = FakeQuanser(AERO, PERIOD)
-    board.fail_next(call)
-    with pytest.raises(QuanserError, match=f"cannot make quanser_aero2_usb '0' ready: {call} was made to fail"):
+    board.fail_next("task_create_reader")
+    with pytest.raises(QuanserError, match="cannot make quanser_aero2_usb '0' ready: task_create_reader was made"):
         plant_of(board)
     assert board.holder is None
-    plant_of(board)  # so another try can have it
-
-
-@pytest.mark.parametrize("call", ["watchdog_start", "task_start"])
-def test_a_board_that_cannot_be_started_is_reported_in_one_line(call: str) -> None:
-    plant, board = plant_on_board(session=False)
-    board.fail_next(call)
-    with pytest.raises(QuanserError, match=f"cannot start quanser_aero2_usb: {call} was made to fail"):
+    plant = plant_of(board)  # so another try can have it
+    board.fail_next("watchdog_start")
+    with pytest.raises(QuanserError, match="cannot start quanser_aero2_usb: watchdog_start was made to fail"):
         plant.advance()
     plant.close()
     assert board.holder is None
 
 
-@pytest.mark.parametrize("failing", [*CLOSING, "none", "all"])
+@pytest.mark.parametrize("failing", ["write_analog", "task_stop", "none", "all"])
 def test_closing_goes_on_when_a_step_fails(failing: str) -> None:
     plant, board = driven_plant()
     if failing == "all":
         board.unplug()
     elif failing != "none":
         board.fail_next(failing)
-    calls = Calls(board)
+    board.calls.clear()
     plant.close()
     plant.close()
-    assert calls.names() == [call for call in CLOSING if failing != "all" or call != "watchdog_stop"]  # once
+    assert list(board.calls) == [call for call in CLOSING if failing != "all" or call != "watchdog_stop"]  # once
     assert board.motor_voltages == (VOLTS if failing == "all" else OFF)
     assert board.holder is None
 
@@ -253,16 +207,15 @@ def test_the_watchdog_is_left_to_do_what_closing_could_not() -> None:
     plant, board = driven_plant()
     for call in ("write_analog", "write_digital"):
         board.fail_next(call)
-    calls = Calls(board)
+    board.calls.clear()
     plant.close()
-    assert "watchdog_stop" not in calls.names()
+    assert "watchdog_stop" not in board.calls
     assert board.watchdog is not None
 
 
 @pytest.mark.parametrize(
     ("changed", "commanded", "written"),
     [
-        ({}, (19.0, -24.0), [18.0, -18.0]),
         ({}, (inf, -inf), [18.0, -18.0]),
         ({"voltage_limit": 5.0}, (4.0, -6.0), [4.0, -5.0]),
         ({}, (nan, 3.0), [0.0, 3.0]),
@@ -316,37 +269,33 @@ def test_a_loop_that_stands_still_leaves_the_motors_at_0_v_when_the_watchdogs_ti
     assert (board.analog, board.enabled) == ([0.0, 0.0], [False, False])
 
 
-@pytest.mark.parametrize("reads_go_on", [True, False])
-def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the_outputs(reads_go_on: bool) -> None:
+def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the_outputs() -> None:
     plant, board = driven_plant()
     plant.actuate(OFF)
-    board.reads_while_expired = reads_go_on
     board.let_pass(WATCHDOG + 1)
-    calls = Calls(board)
+    board.calls.clear()
     plant.advance()
     assert is_nothing(plant.measure())
     assert plant.failure == "the board's watchdog expired"
-    assert not reads_go_on or (plant.passed, plant.failures) == (WATCHDOG + 1, 1)
+    assert (plant.passed, plant.failures) == (WATCHDOG + 1, 1)
     for _ in range(WATCHDOG):
         plant.advance()
     plant.amplify(False)
-    assert not any(call.startswith("write") for call in calls.names())
+    assert not any(call.startswith("write") for call in board.calls)
 
 
-@pytest.mark.parametrize("reads_go_on", [True, False])
-def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_armed(reads_go_on: bool) -> None:
+def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_armed() -> None:
     plant, board = expired_plant()
-    board.reads_while_expired = reads_go_on
-    calls = Calls(board)
+    board.calls.clear()
     for _ in range(5):
         drive(plant, 1)
         assert is_nothing(plant.measure())
         assert board.truth().voltages == OFF
-    assert not {"watchdog_clear", "write_analog", "write_digital"} & set(calls.names())
-    calls = Calls(board)
+    assert not {"watchdog_clear", "write_analog", "write_digital"} & set(board.calls)
+    board.calls.clear()
     drive(plant, 1, OFF)
     clearing = ["watchdog_stop", "watchdog_clear", "watchdog_start", "write_analog", "write_digital"]
-    assert calls.names()[:5] == clearing
+    assert list(board.calls)[:5] == clearing
     assert not is_nothing(plant.measure())
     assert board.truth().voltages == OFF  # though clearing restored the outputs of before
     drive(plant, 1)
@@ -357,7 +306,7 @@ def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_arme
     assert is_nothing(plant.measure())
 
 
-@pytest.mark.parametrize("call", ["watchdog_start", "write_analog", "write_digital"])
+@pytest.mark.parametrize("call", ["watchdog_start", "write_analog"])
 def test_outputs_that_cannot_be_had_back_stay_at_0_v_until_they_can(call: str) -> None:
     plant, board = expired_plant()
     board.fail_next(call)
@@ -376,9 +325,9 @@ def test_a_command_that_could_not_be_written_does_not_reload_the_watchdog() -> N
     plant, board = driven_plant()
     board.fail_next("write_analog")
     for reloads in (False, True):
-        calls = Calls(board)
+        board.calls.clear()
         drive(plant, 1)
-        assert ("watchdog_reload" in calls.names()) == reloads
+        assert ("watchdog_reload" in board.calls) == reloads
         assert not is_nothing(plant.measure())  # what it sees is true all the same
     assert plant.failures == 1
 
@@ -399,11 +348,6 @@ def test_where_reads_or_writes_fail_for_long_the_board_goes_to_0_v_by_itself(cal
 
 
 PERIOD_NS = 2_000_000
-
-
-def turn_encoders(board: FakeQuanser, pitch: int, yaw: int) -> None:
-    board.set_counts(2, pitch)
-    board.set_counts(3, yaw)
 
 
 @pytest.mark.parametrize(
@@ -427,12 +371,12 @@ def test_measurements_are_those_of_an_emulated_aero_with_the_cards_encoders(
     assert abs(board.sample([3], [])[0][0]) > yaw
 
 
-@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
-def test_counts_are_an_angle_each_with_its_sign(signs: tuple[int, int]) -> None:
-    plant, board = plant_on_board(encoder_signs=signs)
-    turn_encoders(board, 160, -512)
+def test_counts_are_an_angle_each_with_its_sign() -> None:
+    plant, board = plant_on_board(encoder_signs=(-1, 1))
+    board.set_counts(2, 160)
+    board.set_counts(3, -512)
     plant.advance()
-    p, y = signs[0] * 2 * pi * 160 / 2880 / 2, signs[1] * 2 * pi * -512 / 4096 / 2
+    p, y = -2 * pi * 160 / 2880 / 2, 2 * pi * -512 / 4096 / 2
     half = cos(y) * cos(p), -sin(y) * sin(p), cos(y) * sin(p), sin(y) * cos(p)  # R_z(yaw) R_y(pitch)
     assert plant.measure().attitude == pytest.approx(half, abs=1e-15)
 
@@ -442,21 +386,18 @@ def test_a_gyros_rates_need_no_filter_and_its_axes_can_be_set() -> None:
     x, y, z = board.truth().rate
     assert 0.0 not in (x, y, z)
     assert plant.measure().rate == (z, -x, -y)
-    with pytest.raises(ValidationError, match="must name each of 1, 2, 3 once"):
-        QuanserSettings(gyro_channels=(1, -1, 2))
 
 
 # Reads that fail
 
 
-@pytest.mark.parametrize("rate", ["derivative", "gyro"])
-def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchdog(rate: str) -> None:
-    plant, board = driven_plant(rate=rate)
+def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchdog() -> None:
+    plant, board = driven_plant()
     board.fail_next("task_read")
-    calls = Calls(board)
+    board.calls.clear()
     drive(plant, 1)
     assert is_nothing(plant.measure())
-    assert "watchdog_reload" not in calls.names()
+    assert "watchdog_reload" not in board.calls
     drive(plant, 1)
     assert not is_nothing(plant.measure())
     assert plant.failures == 1
@@ -489,11 +430,12 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
         twin.advance()
     assert plant.measure().attitude == twin.measure().attitude
     assert plant.passed == 4
-    calls, now = Calls(board), board.time
+    board.calls.clear()
+    now = board.time
     for _ in range(3):  # periods that are over are not waited for
         plant.advance()
         assert is_nothing(plant.measure())
-    assert (calls.names(), board.time) == ([], now)
+    assert (list(board.calls), board.time) == ([], now)
     plant.advance()
     assert not is_nothing(plant.measure())
     assert (board.time, plant.passed) == (now + 1, 1)
@@ -518,44 +460,30 @@ def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: Fa
     assert plant.failures == 10
 
 
-class Loop:
-    """A controller and an endpoint in lockstep, granted at tick 0."""
-
-    def __init__(self, plant: Plant, settings: Settings) -> None:
-        wire, period_ns = settings.wire, settings.loop.period_ns
-        guard = settings.plant.limit_monitor(period_ns, wire.voltage.quantizer().outermost)
-        self.endpoint = Endpoint(plant, wire, period_ns, lockstep=True, limits=guard)
-        assert isinstance(self.endpoint.claim(claim_of(wire=wire, period_ns=period_ns, lockstep=True)), Grant)
-        self.controller = Controller(wire, settings.law, settings.reference, PERIOD)
-        self.measurement = self.endpoint.tick(None, 0)
-        self.k = 0
-
-    def tick(self) -> tuple[bytes | None, bytes | None]:
-        assert self.measurement is not None
-        command = self.controller.tick(self.measurement, self.k)
-        self.k += 1
-        self.measurement = self.endpoint.tick(command, self.k)
-        return command, self.measurement
-
-
 def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_trips_in_the_time_of_its_guard() -> (
     None
 ):
     plant, board = plant_on_board()
-    loop = Loop(plant, Settings())
-    for k in range(200):
+    settings = Settings()
+    wire, period_ns = settings.wire, settings.loop.period_ns
+    guard = settings.plant.limit_monitor(period_ns, wire.voltage.quantizer().outermost)
+    endpoint = Endpoint(plant, wire, period_ns, lockstep=True, limits=guard)
+    assert isinstance(endpoint.claim(claim_of(wire=wire, period_ns=period_ns, lockstep=True)), Grant)
+    controller = Controller(wire, settings.law, settings.reference, PERIOD)
+    measurement = endpoint.tick(None, 0)
+    for k in range(1000):
         if k == 100:
             board.fail_next("task_read")
-        loop.tick()
-    assert loop.endpoint.state is PlantState.DRIVEN
-    assert (loop.controller.invalid, plant.failures) == (1, 1)
-    board.unplug()
-    ticks = 0
-    while loop.endpoint.session is not None and ticks < 1000:
-        loop.tick()
-        ticks += 1
-    assert ticks == 51  # limits.max_invalid_s = 0.1 s of samples without a value, and the one that makes it more
-    assert "no valid value" in loop.endpoint.notices[-1].text
+        if k == 200:
+            assert endpoint.state is PlantState.DRIVEN
+            assert (controller.invalid, plant.failures) == (1, 1)
+            board.unplug()
+        if measurement is None:
+            break
+        measurement = endpoint.tick(controller.tick(measurement, k), k + 1)
+    # limits.max_invalid_s = 0.1 s of samples without a value are 50 ticks, and the one that makes it more
+    assert (k, endpoint.session) == (251, None)
+    assert "no valid value" in endpoint.notices[-1].text
     assert board.analog == [0.0, 0.0]  # no write reaches it any more: the board's watchdog did
     assert board.expired
 

@@ -13,7 +13,6 @@ import pytest
 from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO, FilteredDerivative, Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
-from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 
 PERIOD = 0.002
@@ -70,18 +69,6 @@ def test_encoders_read_whole_counts_within_one_count_of_the_truth() -> None:
     # One count wide and no more; that the outer 2 % are missed by 2000 samples has a chance of e⁻⁴⁰ or so.
     assert (spread < 1 + 1e-9).all()
     assert (spread > 0.98).all()
-
-
-def test_the_attitude_of_encoders_is_yaw_then_pitch() -> None:
-    """R_z(yaw) R_y(pitch), multiplied out as matrices."""
-    sensors = _sensors(rate="perfect", counts=FINE)
-    rng = np.random.default_rng(5)
-    for _ in range(50):
-        p, y = rng.uniform(-7.0, 7.0, 2)  # more than a turn
-        yawed = np.array([[cos(y), -sin(y), 0], [sin(y), cos(y), 0], [0, 0, 1]])
-        pitched = np.array([[cos(p), 0, sin(p)], [0, 1, 0], [-sin(p), 0, cos(p)]])
-        q = sensors.read(IDENTITY, AT_REST, [p, y]).attitude
-        assert np.abs(twin.rotation(np.array(q)) - yawed @ pitched).max() < 2 * 2 * pi / FINE[0]  # a count of each
 
 
 def test_the_rate_of_encoders_is_that_of_the_joints_in_the_body_frame() -> None:

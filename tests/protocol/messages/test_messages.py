@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from math import inf, nan
 from random import Random
 from typing import Any
@@ -13,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from aeroloop.protocol.messages.models import Claim, Event, FaultStatus, Grant, Refusal, Status, Truth
+from aeroloop.protocol.messages.models import Claim, FaultStatus, Status
 from aeroloop.protocol.messages.operator import (
     MAX_GAINS,
     MAX_POINTS,
@@ -75,21 +74,6 @@ def test_a_mutated_message_is_read_or_refused_in_one_short_line(message: Message
             assert len(line) < 2000
 
 
-@given(payload=st.binary(max_size=200))
-def test_any_bytes_are_read_or_refused(payload: bytes) -> None:
-    for model in MODELS:
-        with suppress(MessageError):
-            model.decode(payload)
-
-
-def test_an_unknown_kind_is_refused_also_within_what_may_be_absent() -> None:
-    """A plant's answer to a claim, with the vehicle's last session."""
-    record: dict[str, Any] = {"controller": "c", "session": "s", "gains": {}, "gains_from": "operator"}
-    record |= {"reference": {"kind": "x"}, "reference_from": "operator", "within_s": 1.0, "since_tick": 0}
-    with pytest.raises(MessageError, match=r"last\.reference: .*hold.*stream"):
-        Grant.decode(json.dumps({"session": "s", "last": record}).encode())
-
-
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
 def test_more_values_than_a_message_may_have_are_refused_unparsed(
     model: type[Message], monkeypatch: pytest.MonkeyPatch
@@ -149,28 +133,18 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
 @pytest.mark.parametrize(
     ("model", "fields", "expected"),
     [
-        (Claim, {**CLAIM, "period_ns": 0}, "period_ns: Input should be greater than 0"),
         (Claim, {**CLAIM, "controller": "a/b"}, "controller: String should match pattern"),
         (Claim, {**CLAIM, "session": "s*"}, "session: String should match pattern"),
         (Claim, {**CLAIM, "session": "status"}, "session: 'status' is the key of a topic and cannot name a session"),
-        (Event, {"role": "plant", "kind": "surprised", "text": ""}, "kind: Input should be "),
-        (Truth, {"tick": 0, "attitude": [1, 0, 0], "rate": [0, 0, 0], "voltages": []}, "attitude: Field required"),
-        (Refusal, {"granted": True, "reason": ""}, "granted: Input should be False"),
         (Gains, {"C1": (nan, 0.3, 0.3)}, f"C1: {NUMBER}"),
-        (Gains, {"C1": (inf, 0.3, 0.3)}, f"C1: {NUMBER}"),
         (Gains, {"K": nan}, f"K: {NUMBER}"),
-        (Gains, {"C1": ()}, "C1: Tuple should have at least 1 item"),
         (Gains, {"C1": (0.3,) * (MAX_GAINS + 1)}, f"C1: Tuple should have at most {MAX_GAINS} items"),
-        (Gains, {"C1": "0.3, 0.3, 0.3"}, "C1: Input should be a valid tuple"),
         (Gains, {f"K{i}": 0.3 for i in range(MAX_GAINS + 1)}, f"Gains: a law has {MAX_GAINS} gains at the most"),
         (Points, {"times": [0, 1, 2], "attitudes": TWO}, "Points: 3 times for 2 attitudes"),
         (Points, {"times": [1, 2], "attitudes": TWO}, "Points: the first time must be 0"),
         (Points, {"times": [0, nan], "attitudes": TWO}, f"times: {NUMBER}"),
-        (Points, {"times": [0, 0], "attitudes": TWO}, MILLISECOND),
-        (Points, {"times": [0, 2, 1], "attitudes": [*TWO, TWO[0]]}, MILLISECOND),
         (Points, {"times": [0, 0.0009], "attitudes": TWO}, MILLISECOND),
         (Points, {"times": [0, 1], "attitudes": [TWO[0], (0, nan, 0)]}, f"attitudes: {NUMBER}"),
-        (Points, {"times": [0], "attitudes": TWO}, "times: List should have at least 2 items after validation, not 1"),
         (
             Points,
             {"times": range(MAX_POINTS + 1), "attitudes": TWO},
@@ -179,14 +153,11 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
         (Hold, {"attitude": (0.0, inf, 0.0)}, f"attitude: {NUMBER}"),
         (Setpoint, {"attitude": (0.0, nan, 0.0)}, f"attitude: {NUMBER}"),
         (Sinusoid, {"amplitude": (0.0, nan, 0.0)}, f"amplitude: {NUMBER}"),
-        (Sinusoid, {"frequency": (0.0, -0.1, 0.0)}, "frequency: Input should be greater than or equal to 0"),
         (Sinusoid, {"frequency": (0.0, inf, 0.0)}, "frequency: Input should be less than or equal to 100"),
         (Stream, {"timeout_s": 0.0}, "timeout_s: Input should be greater than 0"),
-        (Stream, {"within_s": 0.01}, "within_s: Input should be greater than or equal to 0.02"),
         (Track, {"reference": Hold(), "within_s": 0.0}, "within_s: Input should be greater than or equal to 0.02"),
         (Request, {"by": "a" * 65}, "by: String should have at most 64 characters"),
         (Request, {"by": "\x1b[2J"}, "by: every character must be printable"),
-        (Track, {"reference": Hold(), "within_s": nan}, "within_s: Input should be less than or equal to 600"),
     ],
 )
 def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
@@ -197,19 +168,3 @@ def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
     error, *_ = refused.value.errors()
     said = f"{error['loc'][0] if error['loc'] else model.__name__}: {error['msg'].removeprefix('Value error, ')}"
     assert said.startswith(expected)
-
-
-@pytest.mark.parametrize(
-    ("model", "fields"),
-    [
-        (Gains, {}),
-        (Gains, {"C1": (20.0, 1e-9, 0.3)}),
-        (Points, {"times": [n / 1000 for n in range(20)], "attitudes": TWO[:1] * 20}),
-        (Points, {"times": range(MAX_POINTS), "attitudes": TWO[:1] * MAX_POINTS}),
-        (Request, {"by": "ä" * 64}),
-        (Stream, {"timeout_s": 60.0, "within_s": 0.02}),
-        (Track, {"reference": Hold(), "within_s": 600.0}),
-    ],
-)
-def test_what_is_just_within_the_bounds_is_taken(model: type[Message], fields: dict[str, Any]) -> None:
-    model.model_validate(fields)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +15,6 @@ from hypothesis import strategies as st
 from aeroloop import protocol
 from aeroloop.protocol.messages.operator import Change, Gains
 from aeroloop.protocol.messages.trace import (
-    HEADER_BYTES,
     MAX_ROWS,
     NEVER,
     ControllerRow,
@@ -27,7 +24,6 @@ from aeroloop.protocol.messages.trace import (
     PlantRow,
     TraceWriter,
     read_batch,
-    row_dtype,
 )
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -79,41 +75,6 @@ def test_the_golden_batch_of_the_plant_is_what_the_writer_writes() -> None:
         add(writer, row)
     writer.operations.append(PlantChange(tick=1001, kind="stop"))
     assert writer.take(5_004_100_000, 1_800_000_000_004_100_000, final=True).hex(" ") == batch.hex(" ")
-
-
-@pytest.mark.parametrize("end", ["controller", "plant"])
-def test_numpy_reads_the_golden_batches_by_the_text_alone(end: End) -> None:
-    rows, batch = golden(end.capitalize())
-    fields = dict(re.findall(r"\| \d+ \| (\w+) \| (u8|u16|u32|u64|i64) \|", SPEC))
-    assert list(fields) == [
-        "version", "end", "flags", "actuators", "measurement_bytes", "command_bytes", "rows", "tail_bytes",
-        "run", "first_row", "monotonic_ns", "wall_ns",
-    ]  # fmt: skip
-    types = {"u8": "<u1", "u16": "<u2", "u32": "<u4", "u64": "<u8", "i64": "<i8"}
-    header = np.frombuffer(batch, [(name, types[kind]) for name, kind in fields.items()], 1)[0]
-    n, at = int(header["rows"]), HEADER_BYTES
-    assert header["version"] == 2
-    assert n == len(rows)
-    dtype = row_dtype(end, int(header["measurement_bytes"]), int(header["command_bytes"]), int(header["actuators"]))
-    assert dtype.names is not None
-    base = int(header["monotonic_ns"])
-    for i, name in enumerate(dtype.names):
-        column = np.frombuffer(batch, dtype[name].base, n * int(np.prod(dtype[name].shape)), at)
-        at += column.nbytes
-        said = [row[i] for row in rows]
-        if name in ("tick", "session_tick", "answered", "received", "sent"):
-            column = np.cumsum(column, dtype=column.dtype)
-        if name in ("received", "sent"):
-            ns = [base + int(us) * 1000 if us != NEVER else 0 for us in column]
-            assert [abs(a - b) < 1000 for a, b in zip(ns, said, strict=True)] == [True] * n
-        elif name == "voltages":
-            assert column.reshape(n, -1).tolist() == [list(volts) for volts in said]
-        elif dtype[name].kind == "V":
-            assert [bytes(frame) for frame in column] == [frame.ljust(column.itemsize, b"\0") for frame in said]
-        else:
-            assert column.tolist() == [value & NEVER if value < 0 else value for value in said]
-    assert len(batch) - at == header["tail_bytes"]
-    json.loads(batch[at:])
 
 
 at_ns = st.integers(10 * S, 12 * S)

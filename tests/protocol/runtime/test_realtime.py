@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import errno
 import gc
 import json
 import os
@@ -75,23 +74,6 @@ def system(
     libc = SimpleNamespace(prctl=lambda *_: 0, mlockall=mlockall)
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: libc)
     monkeypatch.setattr(os, "sched_setscheduler", schedule)
-
-
-@pytest.mark.parametrize(("known", "called"), [(True, [7]), (False, [7, 3])])
-def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_than_4_4(
-    monkeypatch: pytest.MonkeyPatch, cpu_latency: Path, known: bool, called: list[int]
-) -> None:
-    flags: list[int] = []
-
-    def mlockall(value: int) -> int:
-        flags.append(value)
-        ctypes.set_errno(0 if known or value < 4 else errno.EINVAL)
-        return 0 if known or value < 4 else -1
-
-    system(monkeypatch, mlockall)
-    assert prepare_process(LoopSettings(realtime="try")) == []
-    assert flags == called
-    assert cpu_latency.read_bytes() == bytes(4)
 
 
 def test_strict_names_what_is_refused_and_off_asks_for_nothing(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import isnan
 
 import numpy as np
 import pytest
@@ -11,20 +10,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, Throttle, TickGrid
-from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.clock import FakeClock
 
 START = 123_456_789_012_345
 PERIOD = 2_000_000
-
-
-def test_tick_0_is_due_at_once_or_at_the_start_that_is_given() -> None:
-    for start_ns, due_ns in ((None, START), (START + 7 * PERIOD, START + 7 * PERIOD)):
-        clock = FakeClock(START)
-        grid = TickGrid(PERIOD, start_ns, clock)
-        assert (grid.tick, grid.skipped) == (-1, 0)
-        assert grid.wait() == 0
-        assert clock.now_ns == due_ns
 
 
 @settings(max_examples=50)
@@ -81,15 +70,6 @@ def test_it_never_bursts_and_every_tick_is_taken_or_counted(work: list[int]) -> 
     assert all(early < late for early, late in pairwise(ticks))
 
 
-@pytest.mark.parametrize(("rate", "period_ns"), [(500.0, 2_000_000), (1000.0, 1_000_000), (3.0, 333_333_333)])
-def test_a_rate_gives_a_period_in_whole_nanoseconds(rate: float, period_ns: int) -> None:
-    loop = LoopSettings(rate_hz=rate)
-    assert loop.period_ns == period_ns
-    assert loop.period == pytest.approx(period_ns * 1e-9, rel=2.0**-52)
-    assert loop.ticks(50.0) == round(50.0 * rate)
-    assert loop.ticks(0.0) == 0
-
-
 def test_the_first_of_a_kind_passes_and_what_follows_is_held_back_and_counted() -> None:
     clock = FakeClock(0)  # a machine that has just started
     throttle = Throttle(10.0, clock)
@@ -106,17 +86,9 @@ def test_the_first_of_a_kind_passes_and_what_follows_is_held_back_and_counted() 
     assert throttle.let_pass("set-point") is None
     clock.advance(10.0)
     assert throttle.let_pass("stall") == 1  # counted anew
-
-
-def test_a_throttle_is_of_bounded_size_however_many_kinds_there_are() -> None:
-    clock = FakeClock()
-    throttle = Throttle(10.0, clock)
-    sizes = set()
-    for i in range(5 * Throttle.MAX_KINDS):
-        clock.advance(1e-3)
-        assert throttle.let_pass(f"from {i}") == 0
-        sizes.add(sum(len(kept) for kept in vars(throttle).values() if isinstance(kept, dict)))
-    assert max(sizes) == Throttle.MAX_KINDS
+    for i in range(Throttle.MAX_KINDS):
+        throttle.let_pass(f"from {i}")
+    assert throttle.let_pass("stall") == 0  # forgotten with all others: it remembers a bounded number of kinds
 
 
 HALF_A_BIN = 2 ** (1 / 32) * (1 + 1e-9)
@@ -144,14 +116,6 @@ def test_a_percentile_is_within_half_a_bin_and_the_maximum_exact(durations_ns: l
     assert histogram.percentile(percent) >= min(exact_us / HALF_A_BIN, histogram.max_us)
     assert histogram.percentile(percent) <= histogram.max_us == ordered_us[-1]
     assert histogram.count == len(durations_ns)
-
-
-def test_an_empty_histogram_has_no_percentile_and_what_is_beyond_the_last_bin_counts_in_it() -> None:
-    assert isnan(Histogram().percentile(50))
-    assert (Histogram().count, Histogram().max_us) == (0, 0.0)
-    beyond = histogram_of([2**80])
-    assert beyond.max_us == pytest.approx(2**80 * 1e-3, rel=2.0**-50)
-    assert beyond.percentile(100) == pytest.approx(2.0**32, rel=0.022)  # the last bin's middle, half a bin wide
 
 
 def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_seconds_old() -> None:

@@ -8,11 +8,9 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
-from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.zenoh_config import access_control
 from tests.support.certificates import Authority
-from tests.support.certified_link import attempt, linked, open_session, with_marker
-from tests.support.zenoh_network import eventually, free_port
+from tests.support.certified_link import attempt, linked, with_marker
 
 ACTIONS: Final[tuple[Action, ...]] = ("publish", "subscribe", "query", "answer", "hold", "watch")
 KEYS: Final = [
@@ -88,30 +86,6 @@ def test_a_token_bears_the_name_of_its_own_role(authority: Authority) -> None:
         assert sorted(seen) == sorted(own)
         for token in tokens:
             token.undeclare()
-
-
-@pytest.mark.parametrize("topic", [TOPICS[name] for name in topics.RECORDED], ids=topics.RECORDED)
-def test_a_late_recorder_recovers_from_caches_with_rules_at_both_ends(authority: Authority, topic: Topic) -> None:
-    sender, rules = topic.senders[0], with_marker(access_control("aero", loopback=False))
-    reader = "observer" if sender == "recorder" else "recorder"
-    place = [f"tls/127.0.0.1:{free_port()}"]
-    with (
-        open_session(authority.folder / f"{sender}.aero.pem", listen=place, access=rules) as publishing,
-        open_session(authority.folder / f"{reader}.aero.pem", connect=place, access=rules) as reading,
-    ):
-        publisher = CachedPublisher(publishing, topics.key(topic.name, "aero", role=sender), 1.0)
-        for word in (b"1", b"2", b"3"):
-            publisher.put(word)
-        subscriber, found = RecoveringSubscriber(reading, topics.key(topic.name, "*")), list[bytes]()
-
-        def has(count: int) -> bool:
-            found.extend(received.payload for received in subscriber.take())
-            return len(found) >= count
-
-        eventually("recovering", lambda: has(3))
-        publisher.put(b"4")
-        eventually("receiving", lambda: has(4))
-        assert found == [b"1", b"2", b"3", b"4"]
 
 
 @pytest.mark.parametrize("name", ["plant/bero", "controller/bero", "operator/bero", "recorder/bero", "plant", "lab-2"])

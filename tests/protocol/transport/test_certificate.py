@@ -75,10 +75,6 @@ BROKEN: dict[str, tuple[Callable[[Authority], object], tuple[str, ...]]] = {
         lambda ca: ca.issue("controller", "aero", file="plant.aero"),
         ("certificate of controller/aero, not of plant/aero",),
     ),
-    "wrong vehicle": (
-        lambda ca: ca.issue("plant", "aero-2", file="plant.aero"),
-        ("certificate of plant/aero-2, not of plant/aero",),
-    ),
     "no role": (lambda ca: ca.issue("plant", "aero", cn="plant.aero"), ("common name is 'plant.aero'",)),
     "garbage": (lambda ca: (ca.folder / "plant.aero.pem").write_text("-----"), ("is no certificate in PEM",)),
 }

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zenoh
 
 from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.transport.endpoint import Endpoint
@@ -49,19 +48,6 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Frame
     plant.close()
 
 
-def links(session: zenoh.Session | None) -> set[str]:
-    """The reliabilities of a session's links, which cannot be hashed."""
-    assert session is not None
-    return {str(link.reliability) for link in session.info.links()}
-
-
-def test_a_connection_has_datagrams_for_frames_and_a_stream_for_what_zenoh_declares(
-    pair: tuple[FrameSession, FrameSession],
-) -> None:
-    for end in pair:
-        assert links(end.session) == {str(zenoh.Reliability.BEST_EFFORT), str(zenoh.Reliability.RELIABLE)}
-
-
 def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[FrameSession, FrameSession]) -> None:
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
@@ -78,19 +64,6 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[FrameSessi
 
             eventually("a frame each way", there_and_back)
             controller.close()
-        plant.close()
-
-
-@pytest.mark.usefixtures("beyond")
-def test_each_plant_of_a_host_listens_at_a_port_of_its_own() -> None:
-    settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
-    plants = [FrameSession(settings, PLANT), FrameSession(settings, PLANT)]
-    for plant in plants:
-        plant.listen()
-    found = {plant.endpoint.partition("?")[0] for plant in plants}
-    assert len(found) == 2
-    assert found <= {place.replace("tcp", "udp") for place in settings.rendezvous_endpoints}
-    for plant in plants:
         plant.close()
 
 

@@ -127,14 +127,6 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
     token.undeclare()
 
 
-def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
-    mine = of(Authority(tmp_path / "ours"))
-    theirs = of(Authority(tmp_path / "foreign")).model_copy(update={"rendezvous": mine.rendezvous})
-    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, command_session(theirs):
-        pass
-    assert "not of this authority" in one_line(caught.value)
-
-
 def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:

@@ -1,7 +1,7 @@
 """Attitude conventions (C.3)–(C.11): composition of rotations, kinematics, and no η on the wire.
 
-`rotate` below is Rodrigues' formula and `spin` the exact motion at a constant rate; the matrices are compared with
-these.
+`rotate` below is Rodrigues' formula, with which the matrices are compared. T and S, by which they move, are tried in
+tests/plant_emulator/model/test_bodies.py.
 """
 
 from __future__ import annotations
@@ -75,13 +75,6 @@ def rotate(axis: Vector, theta: float, v: Vector) -> Array:
     return np.asarray(turned, dtype=np.float64)
 
 
-def spin(q: Quaternion, omega: Vector, t: float) -> Quaternion:
-    speed = hypot(*omega)
-    if speed == 0:
-        return q
-    return product(q, about((omega[0] / speed, omega[1] / speed, omega[2] / speed), speed * t))
-
-
 def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     w, x, y, z = numbers(attitude.from_euler(ca.SX(ca.DM([roll, pitch, yaw]))))
     return float(w), float(x), float(y), float(z)
@@ -105,20 +98,6 @@ def test_quaternions_multiply_as_hamilton_s_and_their_rotations_as_matrices(p: Q
 def test_r_turns_vectors_as_rodrigues_does(axis: Vector, theta: float, v: Vector) -> None:
     # Vectors up to 5√3 long.
     np.testing.assert_allclose(R(about(axis, theta)) @ v, rotate(axis, theta, v), rtol=0, atol=10 * ROUNDING)
-
-
-H = 1e-5
-"""Step of central differences [s]. At |ω| ≤ 9 rad/s they err by H²|ω|³/6 = 1.2e-8, and rounding adds 1e-11."""
-
-
-@given(quaternions, vectors, vectors)
-def test_t_and_s_say_how_a_quaternion_and_its_rotation_move(q: Quaternion, omega: Vector, v: Vector) -> None:
-    S = numbers(attitude.S(ca.SX(ca.DM(omega))))  # the paper's letter
-    np.testing.assert_allclose(S @ v, np.cross(omega, v), rtol=0, atol=25 * ROUNDING)  # products of numbers up to 5
-    before, after = spin(q, omega, -H), spin(q, omega, H)
-    moved = numbers(attitude.T(ca.SX(ca.DM(q)))) @ omega
-    np.testing.assert_allclose(moved, np.subtract(after, before) / (2 * H), rtol=0, atol=2e-8)
-    np.testing.assert_allclose(R(q) @ S, (R(after) - R(before)) / (2 * H), rtol=0, atol=2e-8)  # (C.10)
 
 
 # Euler angles

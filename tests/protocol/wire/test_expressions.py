@@ -106,19 +106,6 @@ def test_codes_of_consecutive_values_and_levels_are_the_quantizer_s(
         assert same(function.outputs["level"][0], quantizer.level(code))
 
 
-def test_what_is_built_as_written_keeps_its_order_and_the_switch_returns() -> None:
-    def steps() -> ca.SX:
-        return (0.1 * (3.0 * x) + 1) - 1 + 0
-
-    x = ca.SX.sym("x")
-    with as_written():
-        written = ca.Function("f", [x], [steps()])
-    simplified = ca.Function("f", [x], [steps()])
-    for value in (7e-3, -0.0):
-        assert same(float(written(value)), (0.1 * (3.0 * value) + 1) - 1 + 0)
-    assert float(simplified(7e-3)) != float(written(7e-3))
-
-
 def test_two_threads_never_build_as_written_at_once() -> None:
     inside, first_may_end = Event(), Event()
     order: list[str] = []

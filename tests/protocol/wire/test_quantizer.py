@@ -206,16 +206,6 @@ def test_any_value_gets_the_code_of_exact_arithmetic_but_for_the_rounding_of_an_
     assert quantizer.quantize(y) == pytest.approx(float(twin.level(quantizer.encode(y))), rel=0, abs=8 * EPS * limit)
 
 
-@pytest.mark.parametrize("bits", range(MIN_BITS, MAX_BITS + 1))
-@pytest.mark.parametrize("limit", [1.0, 24.0, 3.3e-5])
-def test_at_every_edge_of_the_default_quantizer_a_tie_goes_towards_zero(bits: int, limit: float) -> None:
-    quantizer = UniformQuantizer(bits, limit)
-    for i in range(quantizer.top + 1):
-        edge = float(Fraction(limit) * (2 * i + 1) / (2**bits - 1))  # y0 + i·l, rounded once
-        assert quantizer.encode(edge) == -quantizer.encode(-edge) == i
-        assert quantizer.encode(edge * PAST) == -quantizer.encode(-edge * PAST) == min(i + 1, quantizer.top)
-
-
 # The kind with hysteresis
 
 
@@ -294,11 +284,6 @@ def test_edges_levels_and_codes_are_those_of_the_definition_in_decimals(
     assert abs(quantizer.encode(y)) in codes
 
 
-def test_where_the_longest_interval_is_l_by_design_rounding_does_not_choose_m() -> None:
-    # 0.1 … 0.4 … 0.7 … 1.0; in binary64 the first is longer than the others by a unit in the last place.
-    assert LogarithmicQuantizer(3, 1.0, 0.1, 0.4).growing == 1
-
-
 # No quantization, and what makes no quantizer
 
 
@@ -308,19 +293,16 @@ UNIFORM, HELD, GROWING = UniformQuantizer, HysteresisQuantizer, LogarithmicQuant
 @pytest.mark.parametrize(
     ("kind", "wrong", "why"),
     [
-        *((UNIFORM, (bits, 1.0), "bits") for bits in (-1, 0, 1, 17, 64)),
-        *((UNIFORM, (8, limit), "limit") for limit in (0.0, -0.0, -1.0, inf, -inf, nan)),
-        *((Continuous, (limit,), "limit") for limit in (0.0, -1.0, inf, nan)),
-        *((UNIFORM, (8, 2.0, deadzone), "dead zone") for deadzone in (0.0, -0.1, 2.0, 2.1, inf, nan)),
+        *((UNIFORM, (bits, 1.0), "bits") for bits in (1, 17)),
+        *((UNIFORM, (8, limit), "limit") for limit in (0.0, inf, nan)),
+        (Continuous, (nan,), "limit"),
+        *((UNIFORM, (8, 2.0, deadzone), "dead zone") for deadzone in (0.0, 2.0, nan)),
         *((UNIFORM, (16, limit), "step") for limit in (1e308, 5e-324)),
-        *((HELD, (8, 2.0, None, h), "hysteresis") for h in (0.0, -0.1, 2.0, inf, nan)),
+        *((HELD, (8, 2.0, None, h), "hysteresis") for h in (0.0, 2.0, nan)),
         (GROWING, (2, 2.0), "at least 3 bits"),
         (GROWING, (17, 2.0), "16 bits"),
         (GROWING, (8, 2.0, None, 1.01), "at most half the limit"),
-        (GROWING, (8, 2.0, None, nan), "threshold"),
         (GROWING, (8, 2.0, 0.5), "between 0 and the threshold"),
-        (GROWING, (3, 2.0, None, 0.01), "between 0 and the threshold"),
-        (GROWING, (8, 2.0, 0.0), "dead zone"),
         (GROWING, (16, 2.0, 0.1, 0.1 + 1e-15), "distinguish"),
         (GROWING, (8, 2.0, 5e-324), "distinguish"),
     ],

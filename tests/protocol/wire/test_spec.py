@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, nan
+from math import nan
 
 import pytest
 from hypothesis import given
@@ -18,20 +18,16 @@ HELD, GROWING = {"kind": "hysteresis-uniform"}, {"kind": "logarithmic-uniform"}
 @pytest.mark.parametrize(
     ("section", "broken", "why"),
     [
-        *(("attitude", {"bits": bits}, "attitude") for bits in (1, 17, 8.5, "many")),
-        *(("rate", {"limit": limit}, "rate") for limit in (0.0, inf, nan)),
-        *(("attitude", {"deadzone": deadzone}, "attitude") for deadzone in (0.0, 1.0, nan)),
-        ("rate", {"offset": 0.0}, "offset"),
+        ("attitude", {"bits": 17}, "attitude"),
+        ("rate", {"limit": nan}, "rate"),
+        ("attitude", {"deadzone": 1.0}, "attitude"),
         ("rate", {"hysteresis": 0.1}, 'hysteresis belongs to kind = "hysteresis-uniform"'),
-        ("rate", {**GROWING, "hysteresis": 0.1}, "hysteresis belongs to"),
         ("rate", {"bits": "cont", "threshold": 0.1}, "threshold belongs to"),
         ("rate", {**GROWING, "bits": 2}, "at least 3 bits"),
         ("rate", {**HELD, "hysteresis": 1.0}, "less than the limit"),
-        ("rate", {"kind": "logarithm"}, "kind"),
-        *(("actuators", number, "actuators") for number in (0, 9)),
-        *(("counter_bits", bits, "counter_bits") for bits in (3, 17, "cont")),
-        *(("transmit", wrong, "transmit") for wrong in ("sometimes", {"heartbeat_s": 0}, {"heartbeat": 0.03})),
-        ("thrust", {}, "thrust"),
+        ("actuators", 9, "actuators"),
+        ("counter_bits", 3, "counter_bits"),
+        ("transmit", "sometimes", "transmit"),
     ],
 )
 def test_a_spec_out_of_bounds_is_refused_by_the_name_of_its_field(section: str, broken: object, why: str) -> None:
@@ -43,14 +39,10 @@ def test_a_spec_out_of_bounds_is_refused_by_the_name_of_its_field(section: str, 
 
 
 @given(specs)
-def test_a_spec_survives_json_and_cannot_be_changed(spec: WireSpec) -> None:
+def test_a_spec_survives_json(spec: WireSpec) -> None:
     assert spec.measurement.size > 0  # which caches the format; that is no field
     again = WireSpec.model_validate_json(spec.model_dump_json())
     assert (again, hash(again), again.differences(spec)) == (spec, hash(spec), [])
-    with pytest.raises(ValidationError, match="frozen"):
-        spec.actuators = 3  # type: ignore[misc]  # that is the point
-    with pytest.raises(ValidationError, match="frozen"):
-        spec.rate.bits = 4  # type: ignore[misc]  # the same
 
 
 def test_two_wires_differ_by_every_field_and_both_values() -> None:

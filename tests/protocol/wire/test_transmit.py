@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import Sender, Transmit
 
 COUNTERS = 16
@@ -51,13 +50,6 @@ def test_where_ticks_are_missed_a_change_still_reaches_a_receiver_that_drops_rep
         assert ticks_wrong == 0 or k % COUNTERS == echo
 
 
-def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None:
-    sender = Sender("on_change", 7, COUNTERS)
-    for start in (0, 3, 3 + COUNTERS):
-        assert [sender.due(k, (1, 2)) for k in range(start, start + 3)] == [True, False, False]
-        sender.forget()
-
-
 @given(RUN, RUN, HEARTBEATS)
 def test_a_sender_goes_on_from_the_memory_of_another(
     before: list[tuple[int, int]], after: list[tuple[int, int]], heartbeat: int
@@ -90,9 +82,3 @@ def test_a_frame_whose_bits_differ_is_sent(before: tuple[float, ...], now: tuple
 def test_a_heartbeat_of_so_many_periods_is_as_many_ticks(ticks: int, period_us: int) -> None:
     """However the binary fraction of it is rounded."""
     assert Transmit(heartbeat_s=ticks * period_us / 1e6).heartbeat_ticks(period_us * 1000, 256) == ticks
-
-
-def test_one_word_stands_for_both_directions() -> None:
-    both = WireSpec.model_validate({"transmit": "on_change"}).transmit
-    assert both == Transmit(measurement="on_change", command="on_change")
-    assert WireSpec.model_validate({"transmit": "periodic"}) == WireSpec()
