@@ -185,11 +185,11 @@ def read(model: type[SourcesT], overrides: Iterable[str]) -> SourcesT:
 def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Target:
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
-    Nothing else is read: a mistake in another section does not keep `op stop` from a plant. Names of sections are
-    checked all the same: what stands in `[netwrok]` would otherwise be missed.
+    Nothing else is read: a mistake in another section, or in its name, does not keep `op stop` from a plant. An unknown
+    section is refused if it may be meant as vehicle or network, as `[netwrok]` is: a stop must not miss its plant.
 
     Raises:
-        ConfigError: A source cannot be read, a section is unknown, or vehicle or network is wrong.
+        ConfigError: A source cannot be read, a section is like none of the others, or vehicle or network is wrong.
     """
 
     class Configured(Target, Sources):
@@ -202,5 +202,11 @@ def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Targ
         plant: Any = None
         can: Any = None
         recorder: Any = None
+
+        @model_validator(mode="before")
+        @classmethod
+        def _without_misspelled_other_sections(cls, tree: dict[str, Any]) -> dict[str, Any]:
+            others = {*cls.model_fields} - {*Target.model_fields}
+            return {key: value for key, value in tree.items() if closest(key, cls.model_fields) not in others}
 
     return read(Configured, overrides)

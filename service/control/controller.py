@@ -33,7 +33,7 @@ from aeroloop.service.control.laws.evaluation import (
     law_function,
 )
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
-from aeroloop.service.control.laws.registry import law_of, words_of
+from aeroloop.service.control.laws.registry import law_of, no_number, words_of
 from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import reference_function
 
@@ -240,7 +240,7 @@ class Controller:
             self._last_row[:] = self.row
             command = [*map(self._as_codes, self.outputs["command"])]
         elif self._measured[0]:
-            self.fault = self.fault or f"law {self.law.settings.kind} gave no number"
+            self.fault = self.fault or no_number(self.law)
             for name in _OF_MEASUREMENT:
                 self.last_valid[name][:] = self.outputs[name]
         else:

@@ -12,10 +12,12 @@ import secrets
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from threading import Thread
 from typing import Final
 
+import zenoh
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
@@ -303,8 +305,9 @@ class PlantStatus:
         """Forget the plant's status once its token is gone; called when the token appears or disappears."""
         self._appeared += 1
         if not appeared:
-            while self._received.try_recv() is not None:  # its last ones
-                pass
+            with suppress(zenoh.ZError):  # this process is ending, too, and its ring is gone
+                while self._received.try_recv() is not None:  # its last ones
+                    pass
             self._newest = None
 
     def read(self) -> Status | None:

@@ -31,6 +31,10 @@ class RunFigures:
 
     found: Findings
 
+    def __repr__(self) -> str:
+        """Short, because pytest prints it beside a figure that an assertion compares."""
+        return f"figures of session {self.found.session}"
+
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.found, name)
         if value is None:

@@ -21,15 +21,15 @@ def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "config.toml"
-    file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n')
+    file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n[plnt]\nx = 1\n')
     monkeypatch.setenv("AEROLOOP_LAW__NONE", "1")
     monkeypatch.setenv("AEROLOOP_NETWORK__MODE", "client")
-    found = load_target(file, ["network.insecure=true", "plant.vai=can"])
+    found = load_target(file, ["network.insecure=true", "plant.vai=can", "lop=1"])
     assert (found.vehicle, found.network.mode, found.network.insecure) == ("beta", "client", True)
 
 
 @pytest.mark.parametrize(
-    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "lop=1", "x.y=1"]
+    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "x.y=1"]
 )
 def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
     with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):

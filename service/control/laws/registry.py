@@ -15,7 +15,7 @@ from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import Adaptive
 from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorque
 from aeroloop.service.control.laws.baselines import LQR, PD, PID, Nonadaptive, Sliding
-from aeroloop.service.control.laws.interface import Law, LawSettings
+from aeroloop.service.control.laws.interface import Law, LawSettings, PythonLaw
 
 _OURS: Final[tuple[type[Law[Any]], ...]] = Adaptive, Nonadaptive, PD, PID, AdaptiveTorque, Sliding, LQR
 _OWN: Final = "package.module:Class"
@@ -132,3 +132,10 @@ def words_of(kind: str, error: Exception, called: Any) -> str:
     if kind in BUILT_IN:
         return str(error)
     return f"law {kind}: {exception_line(error, called)}"
+
+
+def no_number(law: Law[Any]) -> str:
+    """That a law gave NaN or infinity, in one line, with file and line of a user's."""
+    kind = law.settings.kind
+    called = law.step if isinstance(law, PythonLaw) else getattr(law, "expressions", None)
+    return f"law {kind} gave no number" + ("" if kind in BUILT_IN else place_of(called))

@@ -49,6 +49,7 @@ def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path)
     assert figures.z_track == judged.z_track
     assert figures.command.frames_per_s == judged.command.frames_per_s
     assert figures.model_dump() == judged.model_dump()
+    assert repr(figures) == f"figures of session {judged.session}"  # pytest prints it in a failed assertion
     lacking = RunFigures(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
     with pytest.raises(HilError, match="the log gives no z_track: nothing answered"):
         _ = lacking.z_track

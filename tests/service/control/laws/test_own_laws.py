@@ -223,7 +223,7 @@ def test_helpers_of_a_law_give_arrays_for_numbers_and_expressions_for_expression
 
 WHY = {
     "raises": f"law {FAILING}:Failing: RuntimeError: the estimator diverged (failing_laws.py, line {{line}})",
-    "gives NaN": f"law {FAILING}:Failing gave no number",
+    "gives NaN": f"law {FAILING}:Failing gave no number (failing_laws.py, line {{step}})",
     "gives one voltage": "it gives 1 voltages for 3 actuators",
     "another shape": "its state after a tick is ticks of 2, and its first state is ticks of 1",
 }
@@ -244,5 +244,6 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
         assert [isnan(u) for u in read[1]] == [k == 3 if failure == "gives NaN" else k >= 3] * 3
         assert (one.fault is not None) == (k >= 3)
     assert one.fault is not None
-    assert WHY[failure].format(line=line) in one.fault
+    step = failing_laws.Failing.step.__code__.co_firstlineno
+    assert WHY[failure].format(line=line, step=step) in one.fault
     assert len(one.fault.splitlines()) == 1
