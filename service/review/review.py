@@ -31,7 +31,8 @@ LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration 
 """Why a session in lockstep has no durations."""
 
 OWN_AFFAIRS: Final = (
-    "loop.realtime", "loop.cpus", "plant.via", "plant.faults", "plant.fault_seed"
+    "loop.realtime", "loop.cpus", "plant.via", "plant.faults", "plant.fault_seed", "plant.armed_at_start",
+    "plant.state_directory",
 )  # fmt: skip
 """Keys that each end has for itself, or that a command sets at the plant alone."""
 
