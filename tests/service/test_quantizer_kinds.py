@@ -45,7 +45,7 @@ def test_a_log_that_begins_in_the_middle_is_replayed_with_what_was_held_then(kin
     make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind, *more), begin=305)
     session = replayed(tmp_path / "a.mcap")
     assert session.first_tick is not None
-    assert session.first_tick >= 305
+    assert 250 < session.first_tick < 305  # of the batch that tick 305 is in
     assert (session.ticks, session.differ) == (TICKS - session.first_tick, 0)
 
 

@@ -22,6 +22,12 @@ PATIENCE_S = 60.0
 COMMAND = [sys.executable, "-P", "-m", "aeroloop"]
 
 
+def take_signals() -> None:
+    """Ignore no signal, as a background job ignores SIGINT and one under nohup SIGHUP."""
+    for one in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(one, signal.SIG_DFL)
+
+
 def start(*command: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         command,
@@ -29,7 +35,7 @@ def start(*command: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in a background job
+        preexec_fn=take_signals,
     )
 
 
