@@ -73,13 +73,13 @@ def test_the_body_follows_a_file_and_a_live_stream_which_is_held_when_it_falls_s
     op(hil, "track", str(points), "--in", "0.5")
     hil.eventually("the change", lambda: hil.happened("changed", "3 points"))
     hil.run(2.6)
-    op(hil, "track", "stream", "--in", "0.5", "--timeout", "0.3")
+    op(hil, "track", "stream", "--in", "0.5")
     key = topics.key("reference", hil.settings.vehicle)
     for yaw in np.linspace(15, 25, 25):
         hil.processes.zenoh.put(key, Setpoint(attitude=(0.0, 0.0, float(yaw))).encode())
         time.sleep(0.02)
     hil.processes.zenoh.put(key, b"nonsense")
-    hil.eventually("its silence", lambda: hil.happened("lost", "no set-point for 0.3 s"))
+    hil.eventually("its silence", lambda: hil.happened("lost", "no set-point for 0.5 s"))
     hil.run(0.5)
     assert hil.happened("fault", "set-point refused")
     assert hil.state("plant") == "driven"
