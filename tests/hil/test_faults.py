@@ -139,7 +139,8 @@ def test_without_the_session_a_stranger_moves_nothing(hil: Hil) -> None:
 def test_frames_of_a_wrong_length_displace_no_good_one_and_are_counted(hil: Hil) -> None:
     """Some thousands a second on both keys of an open loopback. Slack: the watchdog and patience of `PATIENT`."""
     hil.start(settings=PATIENT)
-    hil.eventually("a session", lambda: hil.processes.statuses["controller"].session is not None)
+    statuses = hil.processes.statuses
+    hil.eventually("a session", lambda: "controller" in statuses and statuses["controller"].session is not None)
     running = hil.status("controller").session or ""
     keys = [topics.key(name, "aero", session=running) for name in ("measurement", "command")]
     puts = [hil.processes.zenoh.declare_publisher(key, express=True).put for key in keys]
