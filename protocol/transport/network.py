@@ -1,8 +1,12 @@
 """Network: opens Zenoh's sessions of this process, peer to peer or at a router, without multicast.
 
-Every peer listens at the first free of `PORTS` consecutive ports from `network.rendezvous` on, and connects to
-all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
-end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
+Every peer listens at the first free of `PORTS` consecutive ports from `network.rendezvous` on, and connects to those
+below, as those above connect to it. So a newcomer joins at any process that answers, and no process is needed by the
+others: order of start, end or halt of any of them does not matter. Peers also learn each other's addresses by gossip.
+
+Why not all to all: a process that is halted for longer than the lease, and connects as it goes on, adds that link to its
+session with a peer that has ended the session. Neither would get what the other has declared. The end of a pair that
+connects does so only once its own session has ended, and the other end accepts no second link.
 
 A client links to a router alone, does not listen, and waits until there is one. An operator's command does not listen
 either, and finds which processes accept a connection but do not answer.
@@ -55,10 +59,12 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
     if settings.mode == "client":
         return _join_router(network)
     meeting, further = network.settings.rendezvous_endpoints, network.settings.listen
-    for each in meeting if listen else []:
+    own = {each for each in meeting if Endpoint.parse(each).is_own}
+    for rank, each in enumerate(meeting if listen else []):
         if Endpoint.parse(each).is_free:
+            others = [one for one in meeting if one not in own or one in meeting[:rank]]
             with suppress(zenoh.ZError):  # taken in the meantime
-                return _open(zenoh_config(network, "peer", [each, *further], [one for one in meeting if one != each]))
+                return _open(zenoh_config(network, "peer", [each, *further], others, rank=rank))
     any_port = [str(first.at_port(0)) for first in map(Endpoint.parse, meeting[:1]) if first.is_own]
     try:
         return _open(zenoh_config(network, "peer", [*further, *any_port] if listen else [], meeting))

@@ -13,6 +13,7 @@ brings them nothing of vehicles without rules; what acts names its vehicle.
 from __future__ import annotations
 
 from itertools import product
+from secrets import token_hex
 from typing import Any, Final, Literal
 
 from aeroloop.protocol.messages import topics
@@ -35,7 +36,9 @@ LEASE_MS: Final = 1000
 """A silent peer is disconnected after this [ms]."""
 PATIENT_LEASE_MS: Final = 10_000
 """The same where frames have a session of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
-RETRY_MS: Final = (50, 1000)  # first and longest pause between two attempts to connect to an endpoint
+LAST: Final = 0xFF
+"""The highest rank. Zenoh compares identifiers from their last byte on, so that is the rank."""
+RETRY_MS: Final = (50, 500)  # first and longest pause between two attempts to connect to an endpoint
 
 
 def zenoh_config(
@@ -45,14 +48,19 @@ def zenoh_config(
     connect: list[str],
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = RETRY_MS,
+    rank: int = LAST,
 ) -> dict[str, Any]:
-    """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
+    """Zenoh's configuration of a session that listens at some endpoints and connects to others.
+
+    Of two peers that learn of each other by gossip, the one of the higher rank connects.
+    """
     settings, certificate, vehicles = network
     table = TOPICS.values()
     caches = {topics.cache_key(topics.key(each.name, "*")): each for each in table if each.recorded}
     limits = [(topics.key(each.name, "*"), each.limit, each.request) for each in table]
     limits += [(key, max(each.limit, PAGE_BYTES), topics.MESSAGE_BYTES) for key, each in caches.items()]
     config: dict[str, Any] = {
+        "id": f"1{token_hex(14)}0{min(rank, LAST):02x}",
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
         "connect": {
@@ -73,7 +81,7 @@ def zenoh_config(
             for key, answer, request in limits
             for messages, most in ((["put", "reply"], answer), (["query"], request))
         ],
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True, "autoconnect_strategy": "greater-zid"}},
         "transport": {
             # No use for frames of seven bytes, and a killed process leaves its files behind.
             "shared_memory": {"enabled": False},

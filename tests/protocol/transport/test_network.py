@@ -60,6 +60,8 @@ def test_each_process_listens_at_a_port_of_its_own_and_links_to_all_and_a_comman
             assert [accepts(port) for port in gathering.ports] == [port < taken for port in range(8)]
             members.append(gathering.join())
         linked(members)
+        # One link a pair: one from each end would outlast the other's session, after a halt of a process.
+        assert [len(list(member.info.links())) for member in members] == [3, 3, 3, 3]
         ear = Listener(members[3], "t/word")
         receives(ear, members[0], b"from the first")
         assert set(ear.stamped) == {False}
