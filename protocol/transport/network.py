@@ -4,9 +4,9 @@ Every peer listens at the first free of `PORTS` consecutive ports from `network.
 below, as those above connect to it. So a newcomer joins at any process that answers, and no process is needed by the
 others: order of start, end or halt of any of them does not matter. Peers also learn each other's addresses by gossip.
 
-Why not all to all: a process that is halted for longer than the lease, and connects as it goes on, adds that link to its
-session with a peer that has ended the session. Neither would get what the other has declared. The end of a pair that
-connects does so only once its own session has ended, and the other end accepts no second link.
+Why not all to all: a process that is halted for longer than the lease, and connects as it goes on, adds that link to
+its session with a peer that has ended the session. Neither would get what the other has declared. The end of a pair
+that connects does so only once its own session has ended, and the other end accepts no second link.
 
 A client links to a router alone, does not listen, and waits until there is one. An operator's command does not listen
 either, and finds which processes accept a connection but do not answer.

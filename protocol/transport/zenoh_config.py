@@ -81,7 +81,10 @@ def zenoh_config(
             for key, answer, request in limits
             for messages, most in ((["put", "reply"], answer), (["query"], request))
         ],
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True, "autoconnect_strategy": "greater-zid"}},
+        "scouting": {
+            "multicast": {"enabled": False},
+            "gossip": {"enabled": True, "autoconnect_strategy": "greater-zid"},
+        },
         "transport": {
             # No use for frames of seven bytes, and a killed process leaves its files behind.
             "shared_memory": {"enabled": False},
