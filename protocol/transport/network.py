@@ -1,8 +1,9 @@
 """Network: opens Zenoh's sessions of this process, peer to peer or at a router, without multicast.
 
-Every peer listens at the first free of `PORTS` consecutive ports from `network.rendezvous` on, and connects to those
-below, as those above connect to it. So a newcomer joins at any process that answers, and no process is needed by the
-others: order of start, end or halt of any of them does not matter. Peers also learn each other's addresses by gossip.
+Every peer listens at the first free of `PORTS` consecutive ports from a rendezvous on, and connects to those below, as
+those above connect to it, and to all of other rendezvous. So a newcomer joins at any process that answers, and no
+process is needed by the others: order of start, end or halt of any of them does not matter. Peers also learn each
+other's addresses by gossip.
 
 Why not all to all: a process that is halted for longer than the lease, and connects as it goes on, adds that link to
 its session with a peer that has ended the session. Neither would get what the other has declared. The end of a pair
@@ -28,6 +29,7 @@ import zenoh
 from aeroloop.protocol.transport.certificate import Certificate, refusal
 from aeroloop.protocol.transport.endpoint import Endpoint, accepting
 from aeroloop.protocol.transport.network_settings import (
+    PORTS,
     READER,
     Identity,
     NetworkError,
@@ -59,12 +61,13 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
     if settings.mode == "client":
         return _join_router(network)
     meeting, further = network.settings.rendezvous_endpoints, network.settings.listen
-    own = {each for each in meeting if Endpoint.parse(each).is_own}
-    for rank, each in enumerate(meeting if listen else []):
-        if Endpoint.parse(each).is_free:
-            others = [one for one in meeting if one not in own or one in meeting[:rank]]
-            with suppress(zenoh.ZError):  # taken in the meantime
-                return _open(zenoh_config(network, "peer", [each, *further], others, rank=rank))
+    for first in network.settings.rendezvous if listen else []:
+        ports = [str(each) for each in Endpoint.parse(first).ports(PORTS)]
+        for rank, each in enumerate(ports):
+            if Endpoint.parse(each).is_free:
+                others = [one for one in meeting if one not in ports[rank:]]
+                with suppress(zenoh.ZError):  # taken in the meantime
+                    return _open(zenoh_config(network, "peer", [each, *further], others, rank=rank))
     any_port = [str(first.at_port(0)) for first in map(Endpoint.parse, meeting[:1]) if first.is_own]
     try:
         return _open(zenoh_config(network, "peer", [*further, *any_port] if listen else [], meeting))

@@ -37,7 +37,7 @@ LEASE_MS: Final = 1000
 PATIENT_LEASE_MS: Final = 10_000
 """The same where frames have a session of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
 LAST: Final = 0xFF
-"""The highest rank. Zenoh compares identifiers from their last byte on, so that is the rank."""
+"""Rank of a session without a port of a rendezvous. Zenoh compares identifiers by their last byte: it is the rank."""
 RETRY_MS: Final = (50, 500)  # first and longest pause between two attempts to connect to an endpoint
 
 
@@ -60,7 +60,7 @@ def zenoh_config(
     limits = [(topics.key(each.name, "*"), each.limit, each.request) for each in table]
     limits += [(key, max(each.limit, PAGE_BYTES), topics.MESSAGE_BYTES) for key, each in caches.items()]
     config: dict[str, Any] = {
-        "id": f"1{token_hex(14)}0{min(rank, LAST):02x}",
+        "id": f"1{token_hex(14)}0{rank:02x}",
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
         "connect": {

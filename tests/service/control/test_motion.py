@@ -273,13 +273,16 @@ def test_the_loops_function_gives_the_trajectorys_own_angles(
         trajectory, i = followed.trajectory, followed.trajectory.piece(t)
         taken = trajectory.at(np.full((len(trajectory.starts), 1), t - trajectory.starts[i]))
         angle, rate, acceleration = (part[i, 0] for part in taken)
-        of_rate, of_acceleration = terms(trajectory, i, t, 1), terms(trajectory, i, t, 2)
-        # Either way the terms round by EPS some fifty times: of angles below 10, rates and accelerations.
-        sizes = 10.0, 10 * (1 + of_rate), 10 * (1 + of_rate) ** 2 + of_acceleration
-        for size, got, expected in zip(sizes, followed.at(t), desired_of((angle, rate, acceleration)), strict=True):
-            assert np.abs(got - expected).max() <= 200 * EPS * size
-        for got, expected in zip((angle, rate, acceleration), piece_states(trajectory, i, t), strict=True):
-            assert np.abs(got - expected).max() <= 200 * EPS * (10 + of_rate + of_acceleration)
+        # Either way the terms round by EPS some fifty times: of angles below 10, rates and accelerations. Time rounds
+        # by EPS of t, which counts as one derivative more.
+        of = [terms(trajectory, i, t, order) for order in range(4)]
+        sizes = 10.0, 10 * (1 + of[1]), 10 * (1 + of[1]) ** 2 + of[2]
+        moved = of[1], 10 * (1 + of[1]) + of[2], 10 * (1 + of[1]) * (1 + of[2]) + of[3]
+        desired = desired_of((angle, rate, acceleration))
+        for size, by, got, expected in zip(sizes, moved, followed.at(t), desired, strict=True):
+            assert np.abs(got - expected).max() <= EPS * (200 * size + 4 * t * by)
+        for by, got, expected in zip(of[1:], (angle, rate, acceleration), piece_states(trajectory, i, t), strict=True):
+            assert np.abs(got - expected).max() <= EPS * (200 * (10 + of[1] + of[2]) + 4 * t * by)
 
 
 # ── where an approach goes ──
