@@ -86,6 +86,7 @@ class Plant(ABC):
         paces: Whether `advance` blocks until the next sample, and so paces the loop.
         passed: Periods that passed in the last `advance`; more than one if the call came late. The caller then raises
             its tick index by `passed`, and `advance` returns at once for the periods already over.
+        note: What a status says of it, such as calls of a machine that failed; empty for nothing.
     """
 
     Settings: ClassVar[type[BaseModel]] = NoSettings
@@ -93,6 +94,7 @@ class Plant(ABC):
     actuators: int
     paces: bool = False
     passed: int = 1
+    note: str = ""
 
     def __init__(self, settings: Any, period: float) -> None:
         self.settings = settings
@@ -104,6 +106,9 @@ class Plant(ABC):
 
         They are within `plant.voltage_limit` where the plant is one of a user's; others clip to their own limits.
         """
+
+    def enable(self, on: bool) -> None:  # noqa: B027  # most plants have no power stage
+        """Switch the motors' power stage on for a session and off after it. Called at every tick."""
 
     @abstractmethod
     def advance(self) -> None:
@@ -173,10 +178,14 @@ class OwnPlant(Plant):
         limit = self._limit
         self._call(self._plant.actuate, tuple(max(-limit, min(limit, volts)) for volts in voltages))
 
+    def enable(self, on: bool) -> None:
+        """Switch its power stage."""
+        self._call(self._plant.enable, on)
+
     def advance(self) -> None:
         """Let one period pass."""
         self._call(self._plant.advance)
-        self.passed = self._plant.passed
+        self.passed, self.note = self._plant.passed, self._plant.note
 
     def measure(self) -> Measurement:
         """The sensors' present values."""

@@ -10,15 +10,15 @@ from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from aeroloop.plant_emulator.endpoint.endpoint import LimitMonitor, LimitSettings
-from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
+from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, Faults
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.model.bodies import AeroSettings, Mechanism, RigidBodySettings, aero, rigid_body
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings, RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
-from aeroloop.protocol.wire.spec import WATCHDOG_S
+from aeroloop.protocol.wire.spec import WATCHDOG_S, LoopSettings, WireSpec
 
 Sign: TypeAlias = Literal[-1, 1]
 Channel: TypeAlias = Literal[-3, -2, -1, 1, 2, 3]
@@ -177,15 +177,30 @@ class PlantSettings(BaseModel, extra="forbid"):
             voltage_limit=self.voltage_limit,
         )
 
-    def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
-        """Wrap a plant in the configured faults. Raises FaultError for one of a motor that is not there."""
-        faulty = FaultyPlant(plant, period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
-        faulty.inject(self.parsed_faults, "configured")
-        return faulty
+    def endpoint(self, plant: Plant, loop: LoopSettings, wire: WireSpec) -> Endpoint:
+        """Make the endpoint of a plant, with the configured faults, limits and watchdog.
 
-    def limit_monitor(self, period_ns: int, commanded_limit: float) -> LimitMonitor:
-        """Build the check of the limits; `commanded_limit` is the outermost level of the quantizer [V]."""
-        return LimitMonitor(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
+        Raises:
+            ValueError: The wire commands another number of actuators than the plant has, or a fault is of a motor that
+                it does not have. The plant is closed then: it may be a machine.
+        """
+        faults = Faults(plant.actuators, loop.period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
+        full = min(self.voltage_limit, wire.voltage.quantizer().outermost)
+        try:
+            faults.inject(self.parsed_faults, "configured")
+            return Endpoint(
+                plant,
+                wire,
+                loop.period_ns,
+                lockstep=loop.lockstep,
+                watchdog_s=self.watchdog_s,
+                limits=LimitMonitor(self.limits, loop.period_ns, full),
+                armed=self.armed_at_start,
+                faults=faults,
+            )
+        except ValueError:
+            plant.close()
+            raise
 
 
 _OF_EMULATED: Final = ("aero", "rigid_body", "rotor", "friction", "wind", "sensors")

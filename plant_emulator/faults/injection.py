@@ -1,7 +1,7 @@
 """Faults at work on a plant's sensors, motors and frames, repeatable from a seed.
 
-A FaultyPlant wraps any plant: motor faults change the voltages at the start of a period, sensor faults the sample at
-its end, and `passes` takes the frames of either direction. Faults on one signal act one after another, in the order of
+The endpoint asks `Faults`: motor faults change the voltages at the start of a period, sensor faults the sample at its
+end, and `passes` takes the frames of either direction. Faults on one signal act one after another, in the order of
 injection. Each has its own random numbers, so that another fault leaves its noise unchanged.
 
 Times are the plant's, whole numbers of periods rounded to the nanosecond: a fault starts at exactly the tick of its
@@ -213,25 +213,21 @@ def _rotated(q: Values, error: Sequence[float]) -> Values:
     )
 
 
-class FaultyPlant(Plant):
-    """A plant with faults of its sensors, motors and frames. Before `start` no fault acts.
+class Faults:
+    """Faults of one plant's sensors, motors and frames. Before `start` none acts.
 
     `period` is the time of one `advance` [s], `voltage_limit` the largest voltage of a garbled command [V]; `seed` is 0
     or more.
 
     Attributes:
-        plant: The plant without its faults.
         ticks: Periods since `start`; −1 before.
     """
 
-    def __init__(self, plant: Plant, period: float, *, voltage_limit: float, seed: int = 0) -> None:
-        self.plant = plant
-        self.actuators, self.paces = plant.actuators, plant.paces
+    def __init__(self, actuators: int, period: float, *, voltage_limit: float = 24.0, seed: int = 0) -> None:
         self.ticks = -1
-        self._period, self._limit, self._seed = period, voltage_limit, seed
-        self._commanded: tuple[float, ...] = (0.0,) * plant.actuators
+        self._actuators, self._period, self._limit, self._seed = actuators, period, voltage_limit, seed
+        self._commanded: Values = (0.0,) * actuators
         self._applied = self._commanded
-        self._actuated = False  # since the last period
         self._seen: Measurement | None = None
         self._last_frame: dict[str, bytes] = {}
         self._injected: Counter[str] = Counter()
@@ -263,8 +259,8 @@ class FaultyPlant(Plant):
             FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
         for fault in faults:
-            if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
-                there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
+            if fault.target.whole == "motors" and (fault.target.part or 0) >= self._actuators:
+                there = ", ".join(f"motor{i + 1}" for i in range(self._actuators))
                 raise FaultError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
         staying = 0 if clear else sum(not each.over for each in self._known)
         if staying + len(faults) > MAX_FAULTS:
@@ -299,15 +295,10 @@ class FaultyPlant(Plant):
         for each in self._known:
             if not each.over:
                 each.end = self.ticks
-        self._stop_acting()
-        if self._applied != self._commanded:
-            self.plant.actuate(self._commanded)
-            self._applied = self._commanded
-        return self.transitions()
-
-    def _stop_acting(self) -> None:
         for faults in self._acting.values():
             faults.clear()
+        self._applied = self._commanded
+        return self.transitions()
 
     def transitions(self) -> list[FaultTransition]:
         """Begins and ends up to now that were not returned before, in order of time."""
@@ -320,40 +311,26 @@ class FaultyPlant(Plant):
 
     # ── sensors and motors ──
 
-    def actuate(self, voltages: Sequence[float]) -> None:
-        """Put voltages [V] through the motor faults on the motors. Shape (actuators,)."""
-        self._commanded = tuple(voltages)
-        self._actuated = True
-        self._applied = self._values("motors", self._commanded)
-        self.plant.actuate(self._applied)
+    def voltages(self, commanded: Values) -> Values:
+        """Voltages of the motors [V] in the period that begins, from those commanded. Shape (actuators,)."""
+        self._commanded, self._applied = commanded, self._values("motors", commanded)
+        return self._applied
 
-    def advance(self) -> None:
-        """Let one period pass."""
-        if self._acting["motors"] and not self._actuated:
-            self.actuate(self._commanded)  # a motor also fails and recovers while a voltage is held
-        self._actuated = False
-        self.plant.advance()
-        self.passed = self.plant.passed
-        if self.ticks >= 0:
-            self.ticks += 1
+    def advance(self, plant: Plant) -> None:
+        """A period of the plant has passed."""
+        self.ticks += self.ticks >= 0
         self._seen = None
         if self._acting["attitude"] or self._acting["rate"]:
-            self.measure()  # faults that hold or delay values need every sample
+            self.measure(plant)  # faults that hold or delay values need every sample
 
-    def measure(self) -> Measurement:
-        """Sensor values with their faults; the same until the next `advance`."""
+    def measure(self, plant: Plant) -> Measurement:
+        """The plant's sensor values with their faults; the same until the next `advance`."""
         if self._seen is None:
-            attitude, rate = self.plant.measure()
+            attitude, rate = plant.measure()
             w, x, y, z = self._values("attitude", attitude)
             a, b, c = self._values("rate", rate)
             self._seen = Measurement((w, x, y, z), (a, b, c))
         return self._seen
-
-    def close(self) -> None:
-        """Remove all faults and set 0 V."""
-        self._stop_acting()
-        self._commanded = self._applied = (0.0,) * self.actuators
-        self.plant.close()
 
     def _values(self, whole: str, given: Values) -> Values:
         """Values after the faults of a signal, one after another."""

@@ -14,7 +14,7 @@ import time
 from threading import Condition
 from typing import Final
 
-from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import VehicleClaim
 from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
@@ -116,7 +116,7 @@ class Bridge:
         )
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
-        self._network = ZenohNetwork(role, loop, self._relay, settings.state_directory, self._changed)
+        self._network = ZenohNetwork(role, loop, self._relay, settings, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._number = self._relay.number  # of the last session that the node was sent
         self._arrival: Arrival | None = None  # the last command since the last tick

@@ -1,8 +1,7 @@
 """Loop of the plant end, for any plant and any network: wait → receive → tick → send → account.
 
 A computed plant waits for the tick grid; with hardware `advance` blocks until the next sample; in lockstep the loop
-waits for the answer to its last measurement, so that a run repeats bit for bit. A tick passes the command through the
-injected faults to the endpoint, and the endpoint's measurement through them to the network.
+waits for the answer to its last measurement, so that a run repeats bit for bit.
 """
 
 from __future__ import annotations
@@ -10,23 +9,15 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from math import isfinite
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
-from aeroloop.plant_emulator.faults.injection import FaultTransition
-from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.plant import Plant, PlantError
-from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import FaultStatus, Truth
+from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.timing import Clock, LoopTiming, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
 IDLE_WAIT_S: Final = 0.02
@@ -69,12 +60,10 @@ class PlantNetwork(ABC):
 
     @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """After the measurement was sent: write the tick's trace row, then as `follow_session`.
+        """After a measurement was sent, at `sent_ns` on the monotonic clock: trace row, events, a due status.
 
-        Args:
-            measurement: The endpoint's frame; UNCHANGED if it is not to be sent, None if there is none.
-            arrival: The command received since the last tick, before any injected fault; None for none.
-            sent_ns: When the measurement was sent, on the monotonic clock [ns].
+        `measurement` is what `Endpoint.tick` returned, `arrival` the command received since the last tick; both are
+        before any injected fault.
         """
 
     @abstractmethod
@@ -91,69 +80,38 @@ class PlantNetwork(ABC):
 
 
 class Driver:
-    """Runs the plant end's loop until `stop` is set; `settings` give watchdog, limits, arming and faults.
-
-    Raises:
-        ValueError: The wire commands another number of actuators than the plant has, or a fault is of a motor that it
-            does not have. The plant is closed then.
-
-    Attributes:
-        faulty: The plant with its faults.
-    """
+    """Runs the loop of a plant end until `stop` is set."""
 
     def __init__(
-        self,
-        plant: Plant,
-        loop: LoopSettings,
-        wire: WireSpec,
-        settings: PlantSettings,
-        stop: threading.Event,
-        clock: Clock = time,
+        self, endpoint: Endpoint, network: PlantNetwork, loop: LoopSettings, stop: threading.Event, clock: Clock = time
     ) -> None:
-        self._loop, self._stop, self._clock = loop, stop, clock
-        self._session: str | None = None  # of the last tick
+        self._endpoint, self._network, self._loop, self._stop, self._clock = endpoint, network, loop, stop, clock
         self._counter = 0  # of the measurement sent last
-        self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
-        try:
-            self.faulty = settings.with_faults(plant, loop.period)
-            self.endpoint = Endpoint(
-                self.faulty,
-                wire,
-                loop.period_ns,
-                lockstep=loop.lockstep,
-                watchdog_s=settings.watchdog_s,
-                limits=settings.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost),
-                armed=settings.armed_at_start,
-            )
-        except ValueError:
-            plant.close()  # it may be a machine
-            raise
 
-    def run(self, network: PlantNetwork) -> None:
+    def run(self) -> None:
         """Run until `stop` is set or the plant fails; then close the plant at 0 V and leave the network.
 
         Raises:
             PlantError: A plant of one's own failed; the loop has tripped and says so.
         """
-        self._network = network
-        network.serve()
+        self._network.serve()
         try:
             if self._loop.lockstep:
                 self._run_lockstep()
             else:
                 self._run_real_time()
         except PlantError as error:
-            self.endpoint.stop(TripCause.PLANT, str(error))
+            self._endpoint.stop(TripCause.PLANT, str(error))
             raise
         finally:
             try:
-                self.faulty.close()
+                self._endpoint.plant.close()
             finally:
-                network.leave()
+                self._network.leave()
 
     def _run_real_time(self) -> None:
         """Wait for a tick, receive, tick and send, account; a plant that paces the loop waits in `advance`."""
-        network, endpoint, plant = self._network, self.endpoint, self.faulty
+        network, endpoint, plant = self._network, self._endpoint, self._endpoint.plant
         network.notes = prepare_process(self._loop)
         timing = network.timing = LoopTiming(clock=self._clock)
         grid = None if plant.paces else TickGrid(self._loop.period_ns, clock=self._clock)
@@ -186,7 +144,7 @@ class Driver:
                 self._clock.sleep(IDLE_WAIT_S if network.link is None else 0)
                 network.follow_session()
                 continue
-            echo = self._tick(arrival, self.endpoint.ticked + 1)
+            echo = self._tick(arrival, self._endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
             if network.steps is not None:
                 network.steps -= 1
@@ -199,94 +157,29 @@ class Driver:
         deadline = self._clock.monotonic() + ANSWER_TIMEOUT_S
         while network.link and not self._stop.is_set():
             arrival = network.link.wait(IDLE_WAIT_S)
-            if arrival is not None and self.endpoint.wire.command.counter(arrival.frame) in (echo, None):
+            if arrival is not None and self._endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
             network.take_inbox()
             if self._clock.monotonic() > deadline:
-                self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {ANSWER_TIMEOUT_S:g} s")
+                self._endpoint.expire(TripCause.NO_ANSWER, f"no answer for {ANSWER_TIMEOUT_S:g} s")
             network.follow_session()
         return None
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
-        network, measured, lockstep = self._network, self.endpoint.wire.measurement, self._loop.lockstep
-        measurement = self.tick(arrival.frame if arrival is not None else None, k)
+        network, endpoint, lockstep = self._network, self._endpoint, self._loop.lockstep
+        measurement = endpoint.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = self._clock.monotonic_ns()
-        if measurement == UNCHANGED and not lockstep:  # not a frame, so no fault acts on it
-            outgoing = self.faulty.passes("measurement", None) or [UNCHANGED]
-        else:
-            outgoing = self.faulty.passes("measurement", measurement)
-        echo = None
-        for sent in outgoing:
+        echo, layout = None, endpoint.wire.measurement
+        for sent in endpoint.outgoing:
             if (sent or lockstep) and network.link is not None:
                 network.link.send(sent)
                 network.sent += sent != UNCHANGED
             if lockstep:
                 # The controller takes a frame without a counter for the tick after its last.
-                echo = measured.counter(sent)
-                self._counter = (self._counter + 1) % measured.counters if echo is None else echo
+                echo = layout.counter(sent)
+                self._counter = (self._counter + 1) % layout.counters if echo is None else echo
                 if sent == UNCHANGED:
                     echo = self._counter
         network.after_tick(measurement, arrival, sent_ns)
         return echo
-
-    def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Tick the plant end without the network: `Endpoint.tick`, with the faults of commands before it."""
-        endpoint = self.endpoint
-        if frame and len(frame) != endpoint.wire.command.size:
-            frame = self._malformed
-        if endpoint.session != self._session:
-            self._session = endpoint.session
-            self.faulty.forget_frames()
-            if self._session is not None:
-                self.faulty.start()
-        passed = self.faulty.passes("command", frame)
-        measurement = endpoint.tick(passed[-1] if passed else None, k)
-        if frame is not None and not passed:
-            endpoint.outcome = Outcome.WITHHELD
-        self._notify(self.faulty.transitions())
-        return measurement
-
-    def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
-        """Add faults with start and end counted from now; if `clear`, remove all others first.
-
-        Returns:
-            What was done, a line each; they are events, too.
-
-        Raises:
-            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
-        """
-        self._notify(self.faulty.inject(faults, "injected", clear=clear))
-        names = [*([None] if clear else []), *map(str, faults)]
-        for name in names:
-            self.endpoint.record_change("inject", name=name)
-        done = ["no faults any more" if name is None else f"fault injected: {name}" for name in names]
-        self._notify([FaultTransition(self.faulty.ticks, text) for text in done])
-        return done
-
-    def fault_statuses(self) -> list[FaultStatus]:
-        """Status of every fault."""
-        ticks = self.faulty.ticks
-        return self.faulty.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
-
-    def truth(self) -> Truth | None:
-        """The present true state, with the tick of the measurement taken of it; None where the plant has none."""
-        state, endpoint = self.faulty.plant.truth(), self.endpoint
-        return state and Truth(
-            tick=endpoint.ticked,
-            attitude=state.attitude,
-            rate=state.rate,
-            voltages=state.voltages,
-            signals={name: value if isfinite(value) else None for name, value in state.signals.items()},
-            session=endpoint.session,
-            session_tick=None if endpoint.session is None else endpoint.session_tick,
-        )
-
-    def _notify(self, transitions: Sequence[FaultTransition]) -> None:
-        """Queue events of faults, with the session's tick if there was one then."""
-        endpoint = self.endpoint
-        for transition in transitions:
-            tick = endpoint.event_tick
-            if tick is not None:
-                tick = max(0, tick + transition.tick - self.faulty.ticks)
-            endpoint.notices.append(Notice("fault", transition.text, endpoint.session, tick))

@@ -1,4 +1,4 @@
-"""Quanser Aero on its USB board: plant and driver, by Quanser's HIL interface.
+"""Quanser Aero on its USB board: a plant, by Quanser's HIL interface.
 
 The board samples by its own clock and `advance` waits for the next sample, so the board paces the loop. A measurement
 is this period's sample or NaN; a failed read never repeats the last one. Each good sample reloads the board's watchdog,
@@ -11,7 +11,6 @@ their types are part of the call: channels uint32, analog and other float64, enc
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -21,13 +20,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, FilteredDerivative, attitude_of, rate_of
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
+from aeroloop.plant_emulator.settings import QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
 """Analog outputs that carry the voltages u2 and u3, and digital outputs that enable their amplifiers."""
@@ -46,40 +42,16 @@ class QuanserError(AeroloopError):
     """Quanser's board cannot be used; the message is one line with the reason."""
 
 
-class BoardDriver(Driver):
-    """Drives the Aero on Quanser's board by the board's clock; the amplifier is on during a session only.
-
-    Raises:
-        QuanserError: The interface is missing, or the board cannot be opened.
-        ValueError: The wire does not command two motors.
-    """
-
-    def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
-        self._board = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)
-        super().__init__(self._board, loop, wire, settings, stop)
-
-    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        board, network = self._board, self._network
-        board.amplify(self.endpoint.session is not None)  # after a claim or a release since the last tick
-        echo = super()._tick(arrival, k)
-        board.amplify(self.endpoint.session is not None)  # after a trip in the tick
-        if board.failures:
-            note = f"the board: {board.failures} failed calls, the last: {board.failure}"
-            network.notes = [*(note for note in network.notes if not note.startswith("the board: ")), note]
-        return echo
-
-
 class QuanserPlant(Plant):
     """The Aero on its board. Its encoders are relative: keep the Aero level and at yaw 0 while this object is made.
 
     Each `advance` is one period [s]. After a late call the newest sample is measured, `passed` is the number of periods
     that passed, and the next `passed` − 1 calls return at once and measure NaN. `watchdog_s` is the board's [s].
-    `failures` counts failed calls, reads without a sample and expiries of the watchdog; `failure` is the last one's
-    message.
+    `failures` counts failed calls, reads without a sample and expiries of the watchdog; `note` has the last one.
 
     Raises:
         QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`,
-            `advance` or `amplify`, it cannot be started.
+            `advance` or `enable`, it cannot be started.
     """
 
     actuators = 2
@@ -98,7 +70,7 @@ class QuanserPlant(Plant):
             ) from error
         self._error: type[Exception] = self._hardware.HILError
         self._board: Any = self._hardware.HIL()
-        self.failures, self.failure = 0, ""
+        self.failures = 0
 
         counts = COUNTS[settings.card_type]
         self._steps = [sign * 2 * pi / turn for sign, turn in zip(settings.encoder_signs, counts, strict=True)]
@@ -163,7 +135,7 @@ class QuanserPlant(Plant):
         """Values of the last sample; NaN if it could not be read."""
         return self._measurement
 
-    def amplify(self, on: bool) -> None:
+    def enable(self, on: bool) -> None:
         """Switch the amplifier on for a session, and off after it."""
         if on is not self._driven:
             self._driven = on
@@ -315,7 +287,7 @@ class QuanserPlant(Plant):
 
     def _failed(self, text: str) -> None:
         self.failures += 1
-        self.failure = text
+        self.note = f"the board: {self.failures} failed calls, the last: {text}"
 
 
 def _text(error: Any) -> str:

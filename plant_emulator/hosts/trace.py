@@ -1,6 +1,6 @@
 """Trace of the plant end: its rows written while it runs, and computed again from a log, byte for byte.
 
-`Driver.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the operations
+`Endpoint.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the changes
 between ticks determine every measurement of a plant that is emulated or `repeatable`. A replay starts at the first row
 of the plant's process, where the plant's state is known, and stops at the first missing row.
 """
@@ -8,7 +8,6 @@ of the plant's process, where the plant's state is known, and stops at the first
 from __future__ import annotations
 
 import secrets
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -17,9 +16,8 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import VehicleClaim
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.plant import PlantError, class_of
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Refusal
@@ -162,7 +160,7 @@ class PlantReplay:
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
         if reason := why_not(plant):
             raise ValueError(reason)
-        self._driver = Driver(plant.make(loop.period), loop, wire, plant, threading.Event())
+        self._endpoint = plant.endpoint(plant.make(loop.period), loop, wire)
         self._wire = wire
         self._run: int | None = None
         self._rows = self._ticks = self._differ = 0
@@ -217,7 +215,7 @@ class PlantReplay:
             tick = int(row["tick"])
             while changes and changes[0].tick < tick:
                 self._change(changes.popleft())
-            if self._driver.endpoint.session != header.session:
+            if self._endpoint.session != header.session:
                 raise _StoppedError(f"tick {tick} is in a session whose claim is missing")
             self._compare(header.session, row)
         for change in changes:
@@ -231,8 +229,8 @@ class PlantReplay:
             Sent.NONE: None,
         }
         frame = frames.get(int(logged["received_as"]), bytes(self._wire.command.size + 1))
-        measurement = self._driver.tick(frame, int(logged["tick"]))
-        row = plant_row(self._driver.endpoint, measurement, None, 0)
+        measurement = self._endpoint.tick(frame, int(logged["tick"]))
+        row = plant_row(self._endpoint, measurement, None, 0)
         computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]
         self._ticks += 1
         differ = [name for name in _FIELDS if logged[name].tobytes() != computed[name].tobytes()]
@@ -249,13 +247,13 @@ class PlantReplay:
 
     def _change(self, change: PlantChange) -> None:
         """Advance the plant to a change's tick and apply it."""
-        driver, endpoint = self._driver, self._driver.endpoint
+        endpoint = self._endpoint
         if change.cause is TripCause.PLANT:
             return  # it failed within a tick, which has no row, and its process ended
         if change.tick > endpoint.ticked:
             if endpoint.session is not None:
                 raise _StoppedError(f"rows are missing before tick {change.tick}, where a session runs")
-            driver.tick(None, change.tick)
+            endpoint.tick(None, change.tick)
         name, reason = change.name or "", change.reason or ""
         match change.kind:
             case "claim":
@@ -276,7 +274,7 @@ class PlantReplay:
                 assert change.cause is not None
                 endpoint.expire(change.cause, reason)
             case "inject":
-                driver.inject([Fault.parse(name)] if name else [], clear=not name)
+                endpoint.inject([Fault.parse(name)] if name else [], clear=not name)
         endpoint.changes.clear()
         endpoint.notices.clear()
 

@@ -1,8 +1,7 @@
-"""Plant end on Zenoh.
+"""Plant end on Zenoh: claims and operator commands, the session's link, status, events, trace, true states.
 
-Answers claims and operator commands, opens and closes the session's link, publishes status, events and the trace, and
-counts the frames. Claims, operator commands and lost peers arrive in other threads and are queued until the owner
-takes them between ticks, so that only one thread uses the endpoint.
+Claims, operator commands and lost peers arrive in other threads and are queued until the owner takes them between
+ticks, so that only one thread uses the endpoint.
 """
 
 from __future__ import annotations
@@ -12,34 +11,29 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from pathlib import Path
 from threading import Condition
 from typing import Final
 
 import zenoh
 from zenoh.handlers import RingChannel
 
-from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
-from aeroloop.plant_emulator.hosts.driver import PlantNetwork
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, VehicleClaim
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.latch_file import KEPT_S, Latch, LatchFile
+from aeroloop.plant_emulator.hosts.quanser_board import QuanserPlant
 from aeroloop.plant_emulator.hosts.trace import PlantTrace
+from aeroloop.plant_emulator.plant import Plant
+from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import (
-    Claim,
-    FaultStatus,
-    Grant,
-    Refusal,
-    Release,
-    SessionRecord,
-    Status,
-)
-from aeroloop.protocol.messages.operator import Answer, MessageError, Request
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord, Status
+from aeroloop.protocol.messages.operator import Advance, Answer, Inject, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
-from aeroloop.protocol.wire.spec import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
@@ -47,11 +41,26 @@ OTHERS_PERIOD_NS: Final = 10_000_000
 """How often the statuses of another plant of this name are read, of those the newest."""
 
 
+def run_plant(role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
+    """Run Quanser's board or the plant that `plant.kind` names until the role stops; then 0 V and a last status.
+
+    Raises:
+        QuanserError, PluginError, PlantError: There is no such plant, it cannot be made, or it failed.
+        ValueError: A fault of a motor that the plant does not have, or another number of motors than the wire's.
+    """
+    if settings.via == "quanser":
+        plant: Plant = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)
+    else:
+        plant = settings.make(loop.period)
+    endpoint = settings.endpoint(plant, loop, wire)
+    Driver(endpoint, ZenohNetwork(role, loop, endpoint, settings), loop, role.stop).run()
+
+
 class ZenohNetwork(PlantNetwork):
     """A plant end, an Endpoint or the bridge's Relay, on the network.
 
-    LatchFile keeps the latch in `state_directory`, and one that is there holds from the start. `changed` is notified
-    when a command arrives, for an owner that waits for more than one thing.
+    LatchFile keeps the latch in `plant.state_directory`, and one that is there holds from the start. `changed` is
+    notified when a command arrives, for an owner that waits for more than one thing.
     """
 
     def __init__(
@@ -59,11 +68,16 @@ class ZenohNetwork(PlantNetwork):
         role: Node,
         loop: LoopSettings,
         endpoint: VehicleClaim,
-        state_directory: Path | None,
+        settings: PlantSettings,
         changed: Condition | None = None,
     ) -> None:
         super().__init__()
         self._role, self._loop, self._endpoint, self._changed = role, loop, endpoint, changed
+        self._plant_end = endpoint if isinstance(endpoint, Endpoint) else None  # None: it is behind a bridge
+        self._computed = settings.via == "emulator"
+        self.steps = 0 if settings.steps_on_request else None
+        rate_hz = settings.truth_rate_hz
+        self._truth_every = max(1, round(loop.rate_hz / rate_hz)) if rate_hz else 0
         self._link: ZenohLink | None = None
         self._trace = PlantTrace(endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
@@ -71,7 +85,7 @@ class ZenohNetwork(PlantNetwork):
         self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
         self._received = 0
         self._refused = 0  # by the links of earlier sessions
-        self._latch_file = LatchFile(state_directory, role.vehicle)
+        self._latch_file = LatchFile(settings.state_directory, role.vehicle)
         self._since = datetime.now(UTC) if endpoint.cause else None
         if (found := self._latch_file.found) is not None:
             endpoint.start_tripped(found.cause, found.text, operator_only=found.operator_only)
@@ -97,6 +111,9 @@ class ZenohNetwork(PlantNetwork):
         role.serve("show", Request, lambda _: self._show)
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
         role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
+        if self._computed:
+            role.serve("inject", Inject, self._inject)
+            role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
         if not self._loop.lockstep:
             role.datagrams.listen()
         self._others = role.zenoh.declare_subscriber(
@@ -133,6 +150,9 @@ class ZenohNetwork(PlantNetwork):
             self._sent_at[endpoint.counter] = endpoint.session_tick, sent_ns
         self._received += arrival is not None and arrival.frame != UNCHANGED
         self.follow_session()
+        due = self._truth_every and endpoint.ticked % self._truth_every == 0
+        if due and self._plant_end is not None and (truth := self._plant_end.truth()) is not None:
+            self._role.publish("truth", truth)
 
     def follow_session(self) -> None:
         """Publish events and a due status, keep a new latch, and close the link of a session that ended."""
@@ -154,7 +174,7 @@ class ZenohNetwork(PlantNetwork):
 
     def publish_status(self) -> None:
         """Publish the status: once a second, and after every event and change of state."""
-        endpoint, role = self._endpoint, self._role
+        endpoint, role, end = self._endpoint, self._role, self._plant_end
         now = time.monotonic()
         _, tick, then = self._published
         self._latency.turn_when_due()
@@ -175,21 +195,17 @@ class ZenohNetwork(PlantNetwork):
                 sent=self.sent,
                 refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
                 stale=endpoint.stale,
-                saturated=endpoint.saturated,
+                saturated=end.saturated if end else 0,
                 latency_us=self._latency.total.summary(),
                 recent_latency_us=self._latency.recent().summary(),
                 timing=self.timing.report() if self.timing else None,
-                notes=self.notes,
+                notes=[*self.notes, *([end.plant.note] if end and end.plant.note else [])],
                 lacks_recorder="gone" if self._recorder.gone else None,
-                faults=self.faults(),
+                faults=end.fault_statuses() if end else [],
             )
         )
         self._published = endpoint.state, endpoint.ticked, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
-
-    def faults(self) -> list[FaultStatus]:
-        """Status of every injected fault, which an emulator has."""
-        return []
 
     def leave(self) -> None:
         """Publish the end of the trace, the stop and a last status."""
@@ -240,6 +256,20 @@ class ZenohNetwork(PlantNetwork):
             return Answer(done=True, text="kept")
 
         return keep
+
+    def _inject(self, request: Inject) -> Callable[[], Answer]:
+        def inject() -> Answer:
+            assert self._plant_end is not None
+            done = self._plant_end.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
+            return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
+
+        return inject
+
+    def _advance(self, seconds: float) -> Answer:
+        if self.steps is None:
+            return Answer(done=False, text="this plant steps by itself: set plant.steps_on_request and loop.lockstep")
+        self.steps += self._loop.ticks(seconds)
+        return Answer(done=True, text=f"goes on for {seconds:g} s")
 
     def _show(self) -> SessionRecord | Answer:
         return self._endpoint.last or Answer(done=False, text=f"{self._role.vehicle} has no record of a session")

@@ -108,8 +108,8 @@ def can_node(config: Config = None, overrides: Overrides = None) -> None:
         from aeroloop.plant_emulator.hosts.driver import Driver
 
         loop, plant = settings.loop, settings.plant
-        driver = Driver(plant.make(loop.period), loop, settings.wire, plant, stop)
-        driver.run(CanNetwork(settings.can, loop, driver.endpoint))
+        endpoint = plant.endpoint(plant.make(loop.period), loop, settings.wire)
+        Driver(endpoint, CanNetwork(settings.can, loop, endpoint), loop, stop).run()
 
     run_alone(run)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from contextlib import suppress
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -43,14 +42,13 @@ def show_config(
 
 def _check(settings: Settings) -> None:
     """Make what the configured processes begin with; what does not fit ends the command."""
-    from aeroloop.plant_emulator.hosts.driver import Driver
     from aeroloop.service.control.controller import Controller
 
     with checked():
         Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         if settings.plant.via == "emulator":
             plant, loop = settings.plant, settings.loop
-            Driver(plant.make(loop.period), loop, settings.wire, plant, Event()).endpoint.plant.close()
+            plant.endpoint(plant.make(loop.period), loop, settings.wire).plant.close()
 
 
 @group.command()

@@ -24,16 +24,9 @@ def run_plant(role: Node, settings: Settings) -> None:
 
         Bridge(role, loop, wire, plant, settings.can).run()
         return
-    if plant.via == "emulator":
-        from aeroloop.plant_emulator.hosts.emulator import run_emulator
+    from aeroloop.plant_emulator.hosts import zenoh_network
 
-        run_emulator(role, loop, wire, plant)
-        return
-    from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
-    from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
-
-    driver = BoardDriver(loop, wire, plant, role.stop)
-    driver.run(ZenohNetwork(role, loop, driver.endpoint, plant.state_directory))
+    zenoh_network.run_plant(role, loop, wire, plant)
 
 
 def run_router(role: Node) -> None:

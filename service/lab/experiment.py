@@ -14,7 +14,6 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Claim, Refusal
 from aeroloop.protocol.wire.attitude import Vector
@@ -87,7 +86,7 @@ def experiment(
             return Experiment(_figures(settings, np.arange(ticks), course, unsent), course, compiled=True)
     if plant is not None:
         return _through_frames(settings, duration_s, progress, watch, plant, controller)
-    with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
+    with closing(settings.plant.make(settings.loop.period)) as made:  # 0 V at the end: it may be a machine
         return _through_frames(settings, duration_s, progress, watch, made, controller)
 
 
@@ -142,8 +141,10 @@ def _through_frames(
 ) -> Experiment:
     loop, wire = settings.loop, settings.wire
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
-    limits = settings.plant.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost)
-    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, limits=limits)
+    for fault in settings.plant.parsed_faults:
+        if fault.signal in ("measurement", "command"):
+            raise ValueError(f"fault {fault} acts on frames that cross a network: use `aeroloop demo --lockstep`")
+    endpoint = settings.plant.endpoint(plant, loop.model_copy(update={"lockstep": True}), wire)
     answer = endpoint.claim(
         Claim(controller="experiment", session="lab", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     )
@@ -186,19 +187,6 @@ def _through_frames(
     return Experiment(
         _figures(settings, np.array(used, dtype=np.int64), course, (silent[0], silent[1])), course, compiled=False
     )
-
-
-def _plant(settings: Settings) -> Plant:
-    """The plant with its configured faults; faults of frames need a network."""
-    plant: Plant = settings.plant.make(settings.loop.period)
-    if not settings.plant.faults:
-        return plant
-    for fault in settings.plant.parsed_faults:
-        if fault.signal in ("measurement", "command"):
-            raise ValueError(f"fault {fault} acts on frames that cross a network: use `aeroloop demo --lockstep`")
-    faulty = settings.plant.with_faults(plant, settings.loop.period)
-    faulty.start()
-    return faulty
 
 
 def sent_ticks(codes: Floats, policy: Policy, heartbeat: int) -> Integers:

@@ -236,8 +236,8 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
     level = wire.voltage.quantizer().level
     voltages: list[float] = []
     over = Event()
-    node = Driver(settings.plant.make(loop.period), loop, wire, settings.plant, over)
-    front = CanNetwork(bus, loop, node.endpoint)
+    node = settings.plant.endpoint(settings.plant.make(loop.period), loop, wire)
+    front = CanNetwork(bus, loop, node)
     link = CanLink(bus, wire, "controller", lockstep=True)
     granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(wire, loop.period_ns, lockstep=True))
 
@@ -246,13 +246,13 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
             link.beat(granted)
             over.wait(HEARTBEAT_S)
 
-    threads = [Thread(target=node.run, args=(front,)), Thread(target=beat)]
+    threads = [Thread(target=Driver(node, front, loop, over).run), Thread(target=beat)]
     for thread in threads:
         thread.start()
     try:
         for k in range(loop.ticks(duration_s)):
             arrival = link.wait(PATIENCE_S)
-            assert arrival is not None, f"no measurement {k}: the node is {node.endpoint.cause or node.endpoint.state}"
+            assert arrival is not None, f"no measurement {k}: the node is {node.cause or node.state}"
             command = controller.tick(arrival.frame, k)
             assert command is not None
             if read := wire.command.unpack(command):

@@ -5,14 +5,12 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator
 from math import sin
-from threading import Event
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.trace import PlantReplay, why_not
 from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
@@ -135,7 +133,7 @@ def test_one_motor_or_eight_are_driven_and_replayed_byte_for_byte(kind: str, act
     faults = [f"motor{actuators}:stuck@0.02..0.05", "rate.z:noise=0.05@0.03", "attitude:bias=0.1@0.02..0.06"]
     stage = stage_of(kind, wire, own, faults, lockstep=lockstep).run(TICKS)
     assert stage.endpoint.accepted > TICKS / 2
-    assert sum(fault.changed for fault in stage.driver.fault_statuses()) > 0
+    assert sum(fault.changed for fault in stage.endpoint.fault_statuses()) > 0
     replay = PlantReplay(stage.loop, wire, PlantSettings(kind=f"{HERE}:{kind}", own=own, faults=faults))
     for batch in stage.batches:
         assert batch.columns["voltages"].shape[1:] == (actuators,)
@@ -222,14 +220,12 @@ def _collector_off() -> Iterator[None]:
 @pytest.mark.usefixtures("_collector_off")
 def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_without() -> None:
     loop, wire, settings = LoopSettings(realtime="off"), WireSpec(actuators=1), PlantSettings(watchdog_s=10)
-    driver = Driver(Cyclic(TurntableSettings(), loop.period), loop, wire, settings, stop := Event())
 
     def between(stage: Stage) -> None:
         if stage.endpoint.ticked == 3000:
             stage.claim()
 
-    stage = Stage(loop, wire, settings, driver=driver, between=between)
-    stage.stop = stop
+    stage = Stage(loop, wire, settings, made=Cyclic(TurntableSettings(), loop.period), between=between)
     before = Node.alive
     stage.run(6000)
     assert len(stage.wires.sent) > 200  # until no first command came

@@ -7,7 +7,6 @@ simulated, so the expected content of the log is exact, also of a `rough_loop`, 
 from __future__ import annotations
 
 import random
-import threading
 from collections import Counter
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
@@ -271,8 +269,7 @@ def made(
     messages = Messages()
     drift = rough.chance.choice([0.0, 1e-4, -5e-5]) if rough else 0.0
     plant_clock, clock = Clock("plant"), Clock("controller", drift)
-    emulator = Driver(settings.plant.make(loop.period), loop, wire, settings.plant, threading.Event())
-    endpoint, n = emulator.endpoint, at_ns // 1_000_000
+    endpoint, n = settings.plant.endpoint(settings.plant.make(loop.period), loop, wire), at_ns // 1_000_000
 
     def publish(k: int) -> None:
         """Events and a status of the plant."""
@@ -281,7 +278,7 @@ def made(
         endpoint.notices.clear()
         status = Status(
             role="plant", state=endpoint.state, session=endpoint.session, uptime_s=1 + k * loop.period, ticks=k,
-            rate_hz=loop.rate_hz, skipped=0, faults=emulator.fault_statuses(),
+            rate_hz=loop.rate_hz, skipped=0, faults=endpoint.fault_statuses(),
         )  # fmt: skip
         messages.add("status", status.encode(), plant_clock, "plant")
 
@@ -306,17 +303,17 @@ def made(
         now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
         if k in injected:
             fault = injected[k]
-            emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
+            endpoint.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
         elif rough and rough.happens(0.004):
-            emulator.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
+            endpoint.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
             trace.follow(endpoint)
         arrived = [one for one in coming if one.at_ns <= plant_clock.monotonic_ns()]
         arrival = arrived[-1] if arrived else None  # the newest wins
         coming = coming[len(arrived) :]
-        measurement = emulator.tick(arrival.frame if arrival else None, k)
+        measurement = endpoint.tick(arrival.frame if arrival else None, k)
         assert measurement is not None, endpoint.notices
         trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
-        if truth_every and k % truth_every == 0 and (truth := emulator.truth()) is not None:
+        if truth_every and k % truth_every == 0 and (truth := endpoint.truth()) is not None:
             messages.add("truth", truth.encode(), plant_clock, "plant")
         if k % 100 == 0 and (injected or settings.plant.faults):
             publish(k)

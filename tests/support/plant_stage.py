@@ -15,6 +15,7 @@ from unittest.mock import patch
 
 from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.trace import PlantTrace
+from aeroloop.plant_emulator.plant import Plant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
@@ -79,7 +80,7 @@ class Grid:
 
 
 class Stage(PlantNetwork):
-    """Runs a driver, an emulator's unless given, to a tick.
+    """Runs the driver of the plant `made`, an emulator's unless given, to a tick.
 
     `between` is called between ticks, `answer` with every measurement that is sent (UNCHANGED in lockstep only), and
     `skip` gives the ticks to skip before the next. `sent` are the measurements, `wires` the way of the commands.
@@ -94,13 +95,12 @@ class Stage(PlantNetwork):
         between: Callable[[Stage], None] = lambda _: None,
         answer: Callable[[Stage, bytes], None] = lambda *_: None,
         skip: Callable[[], int] = lambda: 0,
-        driver: Driver | None = None,
+        made: Plant | None = None,
     ) -> None:
         super().__init__()
         self.stop = threading.Event()
         self.loop, self.wire = loop, wire
-        self.driver = driver or Driver(plant.make(loop.period), loop, wire, plant, self.stop)
-        self.endpoint = self.driver.endpoint
+        self.endpoint = plant.endpoint(made or plant.make(loop.period), loop, wire)
         self.wires = Wires(lambda frame: answer(self, frame))
         self._published: deque[bytes] = deque()
         self.trace = PlantTrace(wire, self._published.append, run=RUN)
@@ -116,7 +116,7 @@ class Stage(PlantNetwork):
             patch("aeroloop.plant_emulator.hosts.driver.IDLE_WAIT_S", 0.0),
             patch("aeroloop.plant_emulator.hosts.driver.ANSWER_TIMEOUT_S", -1.0),  # nothing comes by waiting
         ):
-            self.driver.run(self)
+            Driver(self.endpoint, self, self.loop, self.stop).run()
         return self
 
     @property

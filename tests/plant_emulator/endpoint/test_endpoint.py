@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
-from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings, VehicleClaim
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Grant, Refusal, SessionRecord

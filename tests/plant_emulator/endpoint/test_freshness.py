@@ -17,8 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, VehicleClaim
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.models import Grant, Refusal

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
+from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, Faults
 from aeroloop.plant_emulator.faults.language import BY_CHANCE, MAX_DELAY_S, MAX_TIME_S, SIGNALS, Fault, FaultError
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.wire.attitude import Vector
@@ -28,49 +28,63 @@ def sample(k: int) -> Measurement:
     return Measurement((cos(0.01 * k), 0.0, 0.0, sin(0.01 * k)), (1.0 * k, 10.0 * k, 100.0 * k))
 
 
-class Stand(RecordingPlant):
-    """Measures the count of its periods."""
+class Faulty(RecordingPlant):
+    """A plant behind faults, asked as the endpoint asks them. Without them it measures the count of its periods."""
+
+    def __init__(
+        self, *faults: str, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
+    ) -> None:
+        super().__init__(actuators)
+        self.faults = Faults(actuators, period, voltage_limit=LIMIT, seed=seed)
+        self.faults.inject([Fault.parse(fault) for fault in faults], "configured")
+        if started:
+            self.faults.start()
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        super().actuate(self.faults.voltages(tuple(voltages)))
+
+    def advance(self) -> None:
+        super().advance()
+        self.faults.advance(self)
 
     def measure(self) -> Measurement:
         return sample(len(self.periods))
 
+    def seen(self) -> Measurement:
+        return self.faults.measure(self)
 
-def faulty(
-    *faults: str, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
-) -> tuple[FaultyPlant, Stand]:
-    """A plant with these faults, and what is behind them."""
-    stand = Stand(actuators)
-    plant = FaultyPlant(stand, period, voltage_limit=LIMIT, seed=seed)
-    plant.inject([Fault.parse(fault) for fault in faults], "configured")
-    if started:
-        plant.start()
-    return plant, stand
+    def commands(self, frame: bytes | None) -> list[bytes]:
+        return self.faults.passes("command", frame)
+
+    def inject(self, *faults: str, clear: bool = False) -> list[tuple[int, str]]:
+        ends = self.faults.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
+        return [(end.tick, end.text) for end in ends]
 
 
 def sensed(*faults: str, ticks: int = 8, seed: int = 0) -> list[Measurement]:
-    plant, _ = faulty(*faults, seed=seed)
-    seen = [plant.measure()]
+    plant = Faulty(*faults, seed=seed)
+    seen = [plant.seen()]
     for _ in range(ticks):
         plant.advance()
-        seen.append(plant.measure())
+        seen.append(plant.seen())
     return seen
 
 
 def driven(*faults: str, ticks: int = 8, seed: int = 0) -> list[tuple[float, ...]]:
     """What the motors have in the periods that begin at 0, 0.1, 0.2, …, commanded (k, −k)."""
-    plant, stand = faulty(*faults, seed=seed)
+    plant = Faulty(*faults, seed=seed)
     for k in range(ticks):
         plant.actuate((float(k), float(-k)))
         plant.advance()
-    return stand.periods
+    return plant.periods
 
 
-def passed(*faults: str, frames: Sequence[bytes | None], seed: int = 0, period: float = PERIOD) -> list[list[bytes]]:
+def passed(*faults: str, frames: Sequence[bytes | None], seed: int = 0) -> list[list[bytes]]:
     """The commands that pass at 0 s, 0.1 s, 0.2 s and so on."""
-    plant, _ = faulty(*faults, seed=seed, period=period)
+    plant = Faulty(*faults, seed=seed)
     ticks = []
     for frame in frames:
-        ticks.append(plant.passes("command", frame))
+        ticks.append(plant.commands(frame))
         plant.advance()
     return ticks
 
@@ -255,11 +269,6 @@ def test_a_garbled_frame_differs_in_exactly_one_bit_and_in_any() -> None:
     assert passed("command:garble=1", frames=[b""]) == [[b""]]
 
 
-def inject(plant: FaultyPlant, *faults: str, clear: bool = False) -> list[tuple[int, str]]:
-    ends = plant.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
-    return [(end.tick, end.text) for end in ends]
-
-
 # ── begin and end ──
 
 
@@ -273,15 +282,15 @@ def test_a_fault_acts_at_the_ticks_of_its_status_and_events_and_at_no_other(
 ) -> None:
     """Starts and ends are whole milliseconds, most of them between two ticks; 3 · 0.009 < 0.027 in floats."""
     end = "" if length is None else f"..{(start + length) / 1000}"
-    plant, _ = faulty(f"rate:off@{start / 1000}{end}", f"command:off@{start / 1000}{end}", period=period)
+    plant = Faulty(f"rate:off@{start / 1000}{end}", f"command:off@{start / 1000}{end}", period=period)
     acted, events = [], []
     for k in range(round(0.7 / period)):
-        acted.append(missing(plant.measure().rate))
-        assert (plant.passes("command", b"a") == []) == acted[-1]
-        events += [transition.tick for transition in plant.transitions()]
+        acted.append(missing(plant.seen().rate))
+        assert (plant.commands(b"a") == []) == acted[-1]
+        events += [transition.tick for transition in plant.faults.transitions()]
         assert acted[-1] == (start / 1000 <= round(k * period, 9) < (start + (length or 1000)) / 1000)
         plant.advance()
-    for status in plant.statuses(0):
+    for status in plant.faults.statuses(0):
         assert status.begin_tick is not None
         ticks = range(status.begin_tick, len(acted) if status.end_tick is None else status.end_tick)
         assert acted == [k in ticks for k in range(len(acted))]
@@ -290,34 +299,34 @@ def test_a_fault_acts_at_the_ticks_of_its_status_and_events_and_at_no_other(
 
 
 def test_nothing_fails_and_no_time_passes_before_the_start() -> None:
-    plant, stand = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1", started=False)
-    at_once, other = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1")
+    plant = Faulty("rate:off", "motors:off", "command:off", "motor1:noise=1", started=False)
+    at_once = Faulty("rate:off", "motors:off", "command:off", "motor1:noise=1")
     at_once.actuate((3.0, 3.0))
     for k in range(5):
         plant.actuate((3.0, 3.0))
         plant.advance()
-        assert (plant.time, stand.voltages, plant.measure()) == (0.0, (3.0, 3.0), sample(k + 1))
-        assert plant.passes("command", b"a") == [b"a"]
-    plant.start()
+        assert (plant.faults.time, plant.voltages, plant.seen()) == (0.0, (3.0, 3.0), sample(k + 1))
+        assert plant.commands(b"a") == [b"a"]
+    plant.faults.start()
     plant.actuate((3.0, 3.0))
-    assert stand.voltages == other.voltages != (0.0, 0.0)  # nor does the wait use up random numbers
-    assert stand.voltages[1] == 0.0
-    assert missing(plant.measure().rate)
+    assert plant.voltages == at_once.voltages != (0.0, 0.0)  # nor does the wait use up random numbers
+    assert plant.voltages[1] == 0.0
+    assert missing(plant.seen().rate)
 
 
 # ── injection ──
 
 
 def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
-    plant, stand = faulty()
+    plant = Faulty()
     seen = []
     for k in range(1, 9):
         if k == 4:
-            inject(plant, "motor1:delay=0.2", "motor2:stuck", "rate.x:delay=0.2", "rate.y:stuck", "rate.z:off@0.2..0.3")
+            plant.inject("motor1:delay=0.2", "motor2:stuck", "rate.x:delay=0.2", "rate.y:stuck", "rate.z:off@0.2..0.3")
         plant.actuate((1.0 * k, -1.0 * k))
         plant.advance()
-        seen.append(plant.measure())
-    assert stand.periods == [(1, -1), (2, -2), (3, -3), (3, -3), (3, -3), (4, -3), (5, -3), (6, -3)]
+        seen.append(plant.seen())
+    assert plant.periods == [(1, -1), (2, -2), (3, -3), (3, -3), (3, -3), (4, -3), (5, -3), (6, -3)]
     known = [m.rate for m in seen if not missing(m.rate)]
     assert [rate[0] for rate in known] == [1, 2, 3, 3, 4, 5, 6]
     assert [rate[1] for rate in known] == [10, 20, 30, 30, 30, 30, 30]
@@ -326,71 +335,56 @@ def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
 
 
 def test_of_faults_that_cannot_be_none_is_injected() -> None:
-    plant, _ = faulty("rate:off")
+    plant = Faulty("rate:off")
     with pytest.raises(FaultError, match=r"^fault 'motor3:off@2': the plant has no motor3, but motor1, motor2$"):
-        inject(plant, "rate:off", "motor3:off@2", clear=True)
+        plant.inject("rate:off", "motor3:off@2", clear=True)
     with pytest.raises(FaultError, match="op inject --clear"):
-        inject(plant, *["rate:off"] * MAX_FAULTS)
-    assert len(plant.statuses(0)) == 1
-    three, stand = faulty("motor3:off", actuators=3)
+        plant.inject(*["rate:off"] * MAX_FAULTS)
+    assert len(plant.faults.statuses(0)) == 1
+    three = Faulty("motor3:off", actuators=3)
     three.actuate((1.0, 2.0, 3.0))
-    assert stand.voltages == (1.0, 2.0, 0.0)
+    assert three.voltages == (1.0, 2.0, 0.0)
 
 
 def test_faults_that_are_over_make_room() -> None:
     """A plant that receives faults for days keeps a bounded number of them."""
-    plant, _ = faulty(*["command:off@0..0.1"] * MAX_FAULTS)
-    plant.transitions()
+    plant = Faulty(*["command:off@0..0.1"] * MAX_FAULTS)
+    plant.faults.transitions()
     plant.advance()
-    plant.transitions()
-    inject(plant, *["rate:off"] * (MAX_FAULTS - 1))
-    assert [status.source for status in plant.statuses(0)] == ["configured"] + ["injected"] * (MAX_FAULTS - 1)
+    plant.faults.transitions()
+    plant.inject(*["rate:off"] * (MAX_FAULTS - 1))
+    assert [status.source for status in plant.faults.statuses(0)] == ["configured"] + ["injected"] * (MAX_FAULTS - 1)
 
 
 def test_once_cleared_the_plant_is_as_without_faults_and_what_was_to_come_never_begins() -> None:
-    plant, stand = faulty("rate:off", "attitude:off", "motors:off", "command:delay=0.1", "rate:off@9")
-    plant.transitions()
+    plant = Faulty("rate:off", "attitude:off", "motors:off", "command:delay=0.1", "rate:off@9")
+    plant.faults.transitions()
     plant.actuate((5.0, 5.0))
     plant.advance()
-    assert plant.passes("command", b"a") == []
-    ends = inject(plant, clear=True)
+    assert plant.commands(b"a") == []
+    ends = plant.inject(clear=True)
     assert [tick for tick, _ in ends] == [1] * 4
     assert ends[3][1] == "fault ends (configured): command:delay=0.1, 1 commands delayed"
-    assert stand.voltages == (5.0, 5.0)
+    plant.actuate((5.0, 5.0))
+    assert plant.voltages == (5.0, 5.0)
     plant.advance()
-    assert plant.measure() == sample(2)
-    assert plant.passes("command", b"b") == [b"b"]
-    assert [(status.begin_tick, status.end_tick) for status in plant.statuses(10)] == [(10, 11)] * 4
+    assert plant.seen() == sample(2)
+    assert plant.commands(b"b") == [b"b"]
+    assert [(status.begin_tick, status.end_tick) for status in plant.faults.statuses(10)] == [(10, 11)] * 4
 
 
 def test_frames_are_of_one_direction_and_those_held_back_are_lost_with_their_session() -> None:
-    plant, _ = faulty("command:delay=0.1", "measurement:off@0.2")
-    assert plant.passes("command", b"a") == []
-    plant.forget_frames()
+    plant = Faulty("command:delay=0.1", "measurement:off@0.2")
+    assert plant.commands(b"a") == []
+    plant.faults.forget_frames()
     plant.advance()
-    assert plant.passes("command", b"b") == []
-    assert plant.passes("measurement", b"m") == [b"m"]
+    assert plant.commands(b"b") == []
+    assert plant.faults.passes("measurement", b"m") == [b"m"]
     plant.advance()
-    assert plant.passes("command", None) == [b"b"]
-    assert plant.passes("measurement", b"m") == []
-    inject(plant, "command:stuck", clear=True)
-    assert plant.passes("command", b"c") == [b"b"]  # the frame that passed last
-
-
-@pytest.mark.parametrize("fault", ["motors:bias=3", "motors:stuck@0.1", "motors:delay=1"])
-def test_it_is_closed_at_no_voltage_whatever_its_faults_even_one_that_comes_too_late(fault: str) -> None:
-    plant, stand = faulty(fault)
-    for _ in range(3):
-        plant.actuate((5.0, 5.0))
-        plant.advance()
-    assert stand.voltages != (0.0, 0.0) or "delay" in fault
-    plant.close()
-    plant.close()
-    assert stand.voltages == (0.0, 0.0)
-    for clear in (True, False):
-        inject(plant, "motor1:off", clear=clear)
-        plant.advance()
-        assert stand.voltages == (0.0, 0.0)
+    assert plant.commands(None) == [b"b"]
+    assert plant.faults.passes("measurement", b"m") == []
+    plant.inject("command:stuck", clear=True)
+    assert plant.commands(b"c") == [b"b"]  # the frame that passed last
 
 
 # ── random numbers ──
@@ -415,6 +409,6 @@ def test_one_more_fault_leaves_the_random_numbers_of_the_others_and_has_its_own(
     assert [m.rate for m in sensed("rate:noise=0.1", "attitude:garble=0.5")] == alone
     twice = [m.rate[0] - k for k, m in enumerate(sensed("rate:noise=0.1", "rate:noise=0.1"))]
     assert twice != pytest.approx([2 * (rate[0] - k) for k, rate in enumerate(alone)])
-    plant, _ = faulty("command:drop=0.5", "measurement:drop=0.5")
-    passes = [(plant.passes("command", b"a"), plant.passes("measurement", b"a")) for _ in range(100)]
+    plant = Faulty("command:drop=0.5", "measurement:drop=0.5")
+    passes = [(plant.commands(b"a"), plant.faults.passes("measurement", b"a")) for _ in range(100)]
     assert any(command != measurement for command, measurement in passes)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
+from aeroloop.plant_emulator.endpoint.endpoint import Notice
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS
 from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
 from aeroloop.plant_emulator.settings import PlantSettings
@@ -43,7 +43,7 @@ class Run(Stage):
 
     @property
     def statuses(self) -> list[FaultStatus]:
-        return self.driver.fault_statuses()
+        return self.endpoint.fault_statuses()
 
     @property
     def events(self) -> list[Notice]:

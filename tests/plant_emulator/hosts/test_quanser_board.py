@@ -9,15 +9,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from math import cos, inf, isnan, nan, pi, sin
-from threading import Event
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts import quanser_board
-from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver, QuanserError, QuanserPlant
+from aeroloop.plant_emulator.hosts.quanser_board import QuanserError, QuanserPlant
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.sensors import SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
@@ -32,7 +30,6 @@ from tests.support import fake_quanser
 from tests.support.clock import FakeClock
 from tests.support.fake_quanser import BufferOverflowMode, FakeQuanser
 from tests.support.plant_end import claim_of
-from tests.support.plant_stage import Stage
 
 PERIOD = 0.002
 WATCHDOG = 50
@@ -50,7 +47,7 @@ def plant_on_board(
     board = FakeQuanser(settings, PERIOD, card_type=quanser.card_type, realtime=realtime)
     plant = plant_of(board, quanser)
     if session:
-        plant.amplify(True)
+        plant.enable(True)
     return plant, board
 
 
@@ -233,13 +230,13 @@ def test_voltages_are_clipped_no_number_is_0_v_and_motors_can_be_turned(
 def test_the_amplifier_is_on_during_a_session_only() -> None:
     plant, board = plant_on_board(session=False)
     for on in (False, True, False):
-        plant.amplify(on)
+        plant.enable(on)
         volts = VOLTS if on else OFF
         assert board.enabled == [on, on]  # at once
         drive(plant, 3)
         assert (board.enabled, board.truth().voltages) == ([on, on], volts)
         assert board.analog == list(volts)  # not only behind a switch
-    plant.amplify(True)
+    plant.enable(True)
     drive(plant, 500, OFF)
     assert board.enabled == [True, True]
 
@@ -247,7 +244,7 @@ def test_the_amplifier_is_on_during_a_session_only() -> None:
 def test_an_amplifier_that_could_not_be_switched_is_switched_at_the_next_tick() -> None:
     plant, board = driven_plant()
     board.fail_next("write_digital")
-    plant.amplify(False)
+    plant.enable(False)
     assert (board.enabled, board.analog) == ([True, True], [0.0, 0.0])
     plant.actuate(OFF)
     assert board.enabled == [False, False]
@@ -276,11 +273,11 @@ def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the
     board.calls.clear()
     plant.advance()
     assert is_nothing(plant.measure())
-    assert plant.failure == "the board's watchdog expired"
+    assert plant.note.endswith("the last: the board's watchdog expired")
     assert (plant.passed, plant.failures) == (WATCHDOG + 1, 1)
     for _ in range(WATCHDOG):
         plant.advance()
-    plant.amplify(False)
+    plant.enable(False)
     assert not any(call.startswith("write") for call in board.calls)
 
 
@@ -340,7 +337,7 @@ def test_where_reads_or_writes_fail_for_long_the_board_goes_to_0_v_by_itself(cal
         assert (board.truth().voltages == OFF) == (k > WATCHDOG)  # of the period that is over
         plant.actuate(VOLTS)  # the loop that drives it goes on
         if call == "write_digital":
-            plant.amplify(False)
+            plant.enable(False)
             board.analog[:] = VOLTS  # were only the amplifier left to switch the motors off
         plant.advance()
     assert is_nothing(plant.measure())
@@ -401,7 +398,7 @@ def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchd
     drive(plant, 1)
     assert not is_nothing(plant.measure())
     assert plant.failures == 1
-    assert plant.failure == "task_read was made to fail"
+    assert plant.note == "the board: 1 failed calls, the last: task_read was made to fail"
     assert plant.passed == 1
 
 
@@ -465,10 +462,9 @@ def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_
 ):
     plant, board = plant_on_board()
     settings = Settings()
-    wire, period_ns = settings.wire, settings.loop.period_ns
-    guard = settings.plant.limit_monitor(period_ns, wire.voltage.quantizer().outermost)
-    endpoint = Endpoint(plant, wire, period_ns, lockstep=True, limits=guard)
-    assert isinstance(endpoint.claim(claim_of(wire=wire, period_ns=period_ns, lockstep=True)), Grant)
+    wire, loop = settings.wire, LoopSettings(lockstep=True)
+    endpoint = settings.plant.endpoint(plant, loop, wire)
+    assert isinstance(endpoint.claim(claim_of(wire=wire, period_ns=loop.period_ns, lockstep=True)), Grant)
     controller = Controller(wire, settings.law, settings.reference, PERIOD)
     measurement = endpoint.tick(None, 0)
     for k in range(1000):
@@ -486,18 +482,3 @@ def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_
     assert "no valid value" in endpoint.notices[-1].text
     assert board.analog == [0.0, 0.0]  # no write reaches it any more: the board's watchdog did
     assert board.expired
-
-
-def test_failed_calls_of_the_board_are_notes_of_the_status() -> None:
-    plant, board = plant_on_board(session=False)
-    plant.close()  # the driver opens it again
-    loop, wire, stop = LoopSettings(realtime="off"), Settings().wire, Event()
-
-    def fail(stage: Stage) -> None:
-        if stage.endpoint.ticked in (20, 30):
-            board.fail_next("task_read")
-
-    stage = Stage(loop, wire, AERO, driver=BoardDriver(loop, wire, AERO, stop), between=fail)
-    stage.stop = stop
-    stage.run(50)
-    assert stage.notes == ["the board: 2 failed calls, the last: task_read was made to fail"]

@@ -113,7 +113,7 @@ class Mischief:
         if random.random() < 0.02 and not self._quiet:
             clear = random.random() < 0.3
             count = random.choice((0, 1, 2) if clear else (1, 1, 2))
-            stage.driver.inject([Fault.parse(random.choice(FAULTS)) for _ in range(count)], clear=clear)
+            stage.endpoint.inject([Fault.parse(random.choice(FAULTS)) for _ in range(count)], clear=clear)
 
 
 def traced(seed: int) -> tuple[LoopSettings, WireSpec, PlantSettings, list[Batch]]:

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts import latch_file
 from aeroloop.plant_emulator.hosts.driver import Driver
-from aeroloop.plant_emulator.hosts.emulator import EmulatorNetwork
 from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile
+from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Grant, Status
@@ -37,14 +38,15 @@ PLANT = PlantSettings(watchdog_s=1.0, faults=["rate:noise=0.01", "command:drop=0
 @contextmanager
 def running(
     network: NetworkSettings, vehicle: str = "aero", plant: PlantSettings = PLANT
-) -> Iterator[tuple[Node, Driver]]:
+) -> Iterator[tuple[Node, Endpoint]]:
     """An armed emulator on a network, until the context is left, as SIGTERM ends it."""
     with Node("plant", vehicle, network, {}) as role:
-        emulator = Driver(plant.make(LOOP.period), LOOP, WIRE, plant, role.stop)
-        thread = threading.Thread(target=emulator.run, args=(EmulatorNetwork(role, LOOP, emulator, plant),))
+        endpoint = plant.endpoint(plant.make(LOOP.period), LOOP, WIRE)
+        driver = Driver(endpoint, ZenohNetwork(role, LOOP, endpoint, plant), LOOP, role.stop)
+        thread = threading.Thread(target=driver.run)
         thread.start()
         try:
-            yield role, emulator
+            yield role, endpoint
         finally:
             role.stop.set()
             thread.join()
@@ -57,8 +59,8 @@ def test_a_second_plant_of_a_vehicle_refuses_to_start_and_names_the_first() -> N
         eventually("a status", lambda: any(reply.ok is not None for reply in zenoh.get(key)))
         with pytest.raises(OccupiedError, match=r"aero has a plant already \(.*, pid \d+\); stop that one, or"):
             Node("plant", "aero", gathering.settings, {})
-        with running(gathering.settings, "another") as (_, emulator):
-            assert emulator.endpoint.cause is None
+        with running(gathering.settings, "another") as (_, endpoint):
+            assert endpoint.cause is None
 
 
 def test_two_plants_of_a_vehicle_that_meet_both_trip_until_one_has_ended_and_the_other_is_armed() -> None:
@@ -67,12 +69,12 @@ def test_two_plants_of_a_vehicle_that_meet_both_trip_until_one_has_ended_and_the
             both = [*one.settings.rendezvous, *other.settings.rendezvous]
             zenoh = one.join(one.settings.model_copy(update={"rendezvous": both}))  # the cut is healed
             for emulator in (first, second):
-                eventually("the trip", lambda e=emulator: e.endpoint.trip is TripCause.DUPLICATE)  # type: ignore[misc]
-                assert "two plants are named aero" in str(emulator.endpoint.cause)
+                eventually("the trip", lambda e=emulator: e.trip is TripCause.DUPLICATE)  # type: ignore[misc]
+                assert "two plants are named aero" in str(emulator.cause)
         asker = Asker(zenoh, LOOP.period_ns)
         assert "two plants are named aero" in asker.refusal()
         assert asker.ask("arm").done
-        assert first.endpoint.cause is None
+        assert first.cause is None
 
 
 # ── the latch's file ──
@@ -154,7 +156,7 @@ class Plant:
             key, lambda sample: self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
         )
         plant = PlantSettings(state_directory=self._folder)
-        self._role, self.emulator = self._stack.enter_context(running(gathering.settings, plant=plant))
+        self._role, self.endpoint = self._stack.enter_context(running(gathering.settings, plant=plant))
         eventually("a status", lambda: b"uptime_s" in self.asker.query("status"))
         return self
 
@@ -177,8 +179,8 @@ class Plant:
 
     def trip(self) -> None:
         assert self.grants()
-        self._role.enqueue(lambda: self.emulator.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
-        eventually("the trip", lambda: self.emulator.endpoint.trip is not None)
+        self._role.enqueue(lambda: self.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
+        eventually("the trip", lambda: self.endpoint.trip is not None)
 
 
 def test_a_trip_holds_in_the_next_process_until_arm_or_a_claim_with_auto_arm(tmp_path: Path) -> None:
@@ -217,9 +219,9 @@ def test_the_answer_to_a_stop_waits_for_the_disk_and_0_v_does_not(
         operator = threading.Thread(target=stop)
         operator.start()
         assert stuck.wait(PATIENCE_S)
-        assert plant.emulator.endpoint.trip is TripCause.OPERATOR
-        ticked = plant.emulator.endpoint.ticked
-        eventually("a loop that goes on", lambda: plant.emulator.endpoint.ticked > ticked + 10)
+        assert plant.endpoint.trip is TripCause.OPERATOR
+        ticked = plant.endpoint.ticked
+        eventually("a loop that goes on", lambda: plant.endpoint.ticked > ticked + 10)
         assert answers == []
         freed.set()
         operator.join()
@@ -236,5 +238,5 @@ def test_a_plant_that_cannot_keep_a_stop_stops_and_says_so_in_its_answer_and_its
         assert answer.done
         assert "at 0 V" in answer.text
         assert f"but a restart of the plant would forget it: {why}" in answer.text
-        assert plant.emulator.endpoint.trip is TripCause.OPERATOR
+        assert plant.endpoint.trip is TripCause.OPERATOR
         assert plant.arm().text == "aero is armed: the next controller to claim it may drive it"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.emulator import run_emulator
+from aeroloop.plant_emulator.hosts.zenoh_network import run_plant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
@@ -26,7 +26,7 @@ def plant(capsys: pytest.CaptureFixture[str]) -> Iterator[tuple[Inject, Callable
     """`op inject` with exit code and lines of stdout and stderr; the faults of the plant's status; its events."""
     with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
         settings = PlantSettings(faults=["rate:bias=0.1@9"])
-        thread = threading.Thread(target=run_emulator, args=(role, LOOP, WireSpec(), settings))
+        thread = threading.Thread(target=run_plant, args=(role, LOOP, WireSpec(), settings))
         zenoh, events = gathering.join(), list[Event]()
         key = topics.key("event", "aero")
         zenoh.declare_subscriber(key, lambda one: events.append(Event.model_validate_json(one.payload.to_bytes())))
