@@ -14,9 +14,15 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, Li
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, Faults
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.model.bodies import AeroSettings, Mechanism, RigidBodySettings, aero, rigid_body
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings, RotorSettings
-from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
-from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.model.emulated import (
+    EmulatedPlant,
+    FrictionSettings,
+    RotorSettings,
+    Sensors,
+    SensorSettings,
+    Wind,
+    WindSettings,
+)
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
 from aeroloop.protocol.wire.spec import WATCHDOG_S, LoopSettings, WireSpec
 

@@ -13,16 +13,14 @@ from math import cos, radians, sin
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, ClassVar, Final
-from zipfile import ZipFile
 
 from pydantic import BaseModel, Field, model_validator
 
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
-from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.attitude import Quaternion
 
 Name = Annotated[str, Field(min_length=1, max_length=500)]
-Names3 = tuple[str, str, str]
 
 _FATAL: Final = 4
 """FMI's status after which the FMU must not be called again."""
@@ -42,16 +40,11 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
     quaternion: tuple[Name, Name, Name, Name] | None = Field(
         default=None, description="outputs with q, body relative to inertial, scalar part first [1]; or set angles"
     )
-    angles: Names3 | None = Field(
+    angles: tuple[str, str, str] | None = Field(
         default=None,
         description="outputs with roll, pitch and yaw [rad]: yaw about z, then pitch, then roll; '' is 0 always",
     )
-    rate: tuple[Name, Name, Name] | None = Field(
-        default=None, description="outputs with the angular velocity in the body frame [rad/s]; or set angle_rates"
-    )
-    angle_rates: Names3 | None = Field(
-        default=None, description="outputs with the derivatives of roll, pitch and yaw [rad/s]; '' is 0 always"
-    )
+    rate: tuple[Name, Name, Name] = Field(description="outputs with the angular velocity in the body frame [rad/s]")
     start: dict[str, bool | int | float | str | list[float]] = Field(
         default={}, description="start values and parameters, by the FMU's names, in the FMU's units"
     )
@@ -60,10 +53,6 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
     def _one_of_each(self) -> FmuSettings:
         if (self.quaternion is None) == (self.angles is None):
             raise ValueError("set either quaternion or angles: the FMU's outputs with the attitude")
-        if (self.rate is None) == (self.angle_rates is None):
-            raise ValueError("set either rate or angle_rates: the FMU's outputs with the angular velocity")
-        if self.angle_rates is not None and self.angles is None:
-            raise ValueError("angle_rates needs angles: with a quaternion, set rate")
         if len(set(self.voltages)) < len(self.voltages):
             raise ValueError("voltages must name each input once")
         return self
@@ -82,9 +71,9 @@ class FmuPlant(Plant):
     def __init__(self, settings: FmuSettings, period: float) -> None:
         self._settings, self._name, self._period = settings, settings.file.name, period
         self._description = _description(settings.file)
-        self._fmi2 = self._description.fmiMajorVersion == 2
+        self._real = "Real" if self._description.fmiMajorVersion == 2 else "Float64"
         self._inputs = [self._reference(name, "input")[0] for name in settings.voltages]
-        outputs = [*(settings.quaternion or settings.angles or ()), *(settings.rate or settings.angle_rates or ())]
+        outputs = [*(settings.quaternion or settings.angles or ()), *settings.rate]
         self._outputs = {name: self._reference(name, "output", "local") for name in outputs if name}
         self.actuators = len(self._inputs)
         self._voltages = [0.0] * self.actuators
@@ -101,14 +90,12 @@ class FmuPlant(Plant):
             raise
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Hold voltages [V] from the next period on. Shape (actuators,)."""
         self._voltages = [float(voltage) for voltage in voltages]
 
     def advance(self) -> None:
-        """Advance the FMU by one period."""
         time = self._periods * self._period
         try:
-            (self._fmu.setReal if self._fmi2 else self._fmu.setFloat64)(self._inputs, self._voltages)
+            self._set(self._inputs, self._voltages)
             ended = self._fmu.doStep(time, self._period)
             if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
                 raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._words}")
@@ -118,15 +105,12 @@ class FmuPlant(Plant):
             raise self._failure(f"it failed at {time:g} s", error) from None
 
     def measure(self) -> Measurement:
-        """The FMU's outputs at the end of the last period."""
         return self._measurement
 
     def truth(self) -> State:
-        """The same, with the voltages."""
         return State(*self._measurement, tuple(self._voltages))
 
     def close(self) -> None:
-        """End and free the FMU, and remove its unpacked files. A second call does nothing."""
         if self._fmu is not None and not self._fatal:
             with suppress(Exception):  # one that failed may refuse to be ended, and is freed nonetheless
                 self._fmu.terminate()
@@ -136,51 +120,51 @@ class FmuPlant(Plant):
 
     def _reference(self, name: str, *causalities: str) -> tuple[int, float]:
         """Value reference of a real scalar of one of these causalities, and its unit in rad, rad/s or its own."""
-        real = "Real" if self._fmi2 else "Float64"
         fitting = {
             each.name: each
             for each in self._description.modelVariables
-            if each.causality in causalities and each.type == real and not each.shape
+            if each.causality in causalities and each.type == self._real and not each.shape
         }
         if name not in fitting:
             listed = ", ".join(list(fitting)[:8]) + (f" and {len(fitting) - 8} more" if len(fitting) > 8 else "")
-            raise FmuError(f"{self._name} has no {causalities[0]} {name} of type {real}; it has {listed or 'none'}")
+            raise FmuError(
+                f"{self._name} has no {causalities[0]} {name} of type {self._real}; it has {listed or 'none'}"
+            )
         variable = fitting[name]
         unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
         return variable.valueReference, radians(1) if unit.startswith("deg") else 1.0
 
     def _start(self) -> None:
-        """Unpack, load and initialize it with the start values and parameters."""
         import fmpy
         from fmpy.simulation import apply_start_values, settable_in_initialization_mode, settable_in_instantiated
 
         try:
             fmpy.extract(self._settings.file, self._folder.name)
             with chdir("."):  # FMPy changes the folder to load the library, and does not return where that fails
-                self._fmu = fmpy.instantiate_fmu(self._folder.name, self._description, "CoSimulation", logger=self._log)
-            if self._fmi2:
-                self._fmu.setupExperiment(startTime=0.0)
-            unset = apply_start_values(self._fmu, self._description, self._settings.start, settable_in_instantiated)
-            self._fmu.enterInitializationMode()
-            unset = apply_start_values(self._fmu, self._description, unset, settable_in_initialization_mode)
+                fmu = fmpy.instantiate_fmu(self._folder.name, self._description, "CoSimulation", logger=self._log)
+            self._fmu = fmu
+            self._set, self._get = getattr(fmu, f"set{self._real}"), getattr(fmu, f"get{self._real}")
+            if self._real == "Real":
+                fmu.setupExperiment(startTime=0.0)
+            unset = apply_start_values(fmu, self._description, self._settings.start, settable_in_instantiated)
+            fmu.enterInitializationMode()
+            unset = apply_start_values(fmu, self._description, unset, settable_in_initialization_mode)
             if unset:
                 raise FmuError(f"{self._name} has no parameter or start value {', '.join(unset)}: see plant.own.start")
-            self._fmu.exitInitializationMode()
+            fmu.exitInitializationMode()
         except Exception as error:
             raise self._failure("it does not start", error) from None
 
     def _sample(self) -> None:
-        read, settings = (self._fmu.getReal if self._fmi2 else self._fmu.getFloat64), self._settings
-        values = read([reference for reference, _ in self._outputs.values()])
+        values = self._get([reference for reference, _ in self._outputs.values()])
         of = {name: value * scale for (name, (_, scale)), value in zip(self._outputs.items(), values, strict=True)}
         of[""] = 0.0
-        roll, pitch, yaw = (of[name] for name in settings.angles or ("", "", ""))
-        a, b, c = (of[name] for name in settings.rate or settings.angle_rates or ("", "", ""))
-        attitude = quaternion_of(roll, pitch, yaw)
-        if settings.quaternion:
-            w, x, y, z = (of[name] for name in settings.quaternion)
-            attitude = w, x, y, z
-        self._measurement = Measurement(attitude, (a, b, c) if settings.rate else body_rate((roll, pitch), (a, b, c)))
+        if self._settings.quaternion:
+            w, x, y, z = (of[name] for name in self._settings.quaternion)
+        else:
+            w, x, y, z = quaternion_of(*(of[name] for name in self._settings.angles or ()))
+        a, b, c = (of[name] for name in self._settings.rate)
+        self._measurement = Measurement((w, x, y, z), (a, b, c))
 
     def _log(self, *message: Any) -> None:
         """Keep a message of the FMU. FMI 2 gives the FMU's name, too, before these three."""
@@ -207,21 +191,7 @@ def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
     )
 
 
-def body_rate(angles: tuple[float, float], derivatives: Vector) -> Vector:
-    """ω [rad/s] from roll φ and pitch θ [rad] and the derivatives of roll, pitch and yaw ψ [rad/s].
-
-    ω = [φ̇ − ψ̇ sin θ, θ̇ cos φ + ψ̇ sin φ cos θ, −θ̇ sin φ + ψ̇ cos φ cos θ]
-    """
-    (roll, pitch), (d_roll, d_pitch, d_yaw) = angles, derivatives
-    return (
-        d_roll - sin(pitch) * d_yaw,
-        cos(roll) * d_pitch + sin(roll) * cos(pitch) * d_yaw,
-        -sin(roll) * d_pitch + cos(roll) * cos(pitch) * d_yaw,
-    )
-
-
 def _description(file: Path) -> Any:
-    """The FMU's model description, if it can be used here."""
     try:
         import fmpy
     except ModuleNotFoundError as missing:
@@ -232,13 +202,9 @@ def _description(file: Path) -> Any:
     try:
         with file.open("rb") as opened:  # FMPy would not close it
             description = fmpy.read_model_description(opened, validate=False)
-            files = ZipFile(opened).namelist()
         version = description.fmiMajorVersion
     except Exception as error:
         raise FmuError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
     if version not in (2, 3) or description.coSimulation is None:
         raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for co-simulation by FMI 2 or 3")
-    platform = fmpy.platform if version == 2 else fmpy.platform_tuple
-    if not any(name.startswith(f"binaries/{platform}/") for name in files):
-        raise FmuError(f"{file.name} has no binary for {platform}: export it on this platform, or `fmpy compile` it")
     return description

@@ -16,8 +16,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.model.emulated import RotorSettings
-from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
+from aeroloop.plant_emulator.model.emulated import RotorSettings, Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
@@ -90,11 +89,9 @@ class MujocoPlant(Plant):
         self._sense()
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Hold voltages [V]; the model clips its controls to their ranges. Shape (actuators,)."""
         self._commanded = [float(voltage) for voltage in voltages]
 
     def advance(self) -> None:
-        """Step through one period and sample the sensors."""
         step, model, data = self._mujoco.mj_step, self._model, self._data
         half = model.opt.timestep / 2
         for _ in range(self._substeps):
@@ -105,19 +102,15 @@ class MujocoPlant(Plant):
         self._sense()
 
     def measure(self) -> Measurement:
-        """Sensor values at the end of the last period."""
         return self._measurement
 
     def truth(self) -> State:
-        """The present true state, and the commanded voltages."""
         return State(self._attitude, self._rate, tuple(self._commanded))
 
     def close(self) -> None:
-        """0 V."""
         self.actuate((0.0,) * self.actuators)
 
     def _loaded(self, model: str) -> Any:
-        """The compiled model."""
         load = self._mujoco.MjModel
         try:
             if model.lstrip().startswith("<"):
@@ -131,7 +124,6 @@ class MujocoPlant(Plant):
             raise PluginError(f"MuJoCo refuses the MJCF {'given' if '<' in model else model}: {said}") from None
 
     def _found(self, kind: str, name: str) -> Any:
-        """The key, body or joint that the model calls `name`."""
         try:
             return getattr(self._model, kind)(name)
         except KeyError as error:  # "Invalid name 'rotor'. Valid names: ['body', 'world']"

@@ -40,11 +40,9 @@ class CanNetwork(PlantNetwork):
 
     @property
     def link(self) -> Link | None:
-        """Link of the session's frames; None without a session."""
         return self._bus if self._endpoint.session is not None else None
 
     def serve(self) -> None:
-        """Send the first heartbeat."""
         bus = self._settings
         self._log("started", f"node {bus.node} waits on {bus.interface}:{bus.channel}")
         self.follow_session()
@@ -68,7 +66,6 @@ class CanNetwork(PlantNetwork):
         self.follow_session()
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """As `follow_session`. The bridge writes the trace."""
         del measurement, arrival, sent_ns
         self.follow_session()
 

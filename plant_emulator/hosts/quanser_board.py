@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, FilteredDerivative, attitude_of, rate_of
+from aeroloop.plant_emulator.model.emulated import NO_MEASUREMENT, FilteredDerivative, attitude_of, rate_of
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
@@ -132,11 +132,9 @@ class QuanserPlant(Plant):
         self._advanced_ns = time.monotonic_ns()
 
     def measure(self) -> Measurement:
-        """Values of the last sample; NaN if it could not be read."""
         return self._measurement
 
     def enable(self, on: bool) -> None:
-        """Switch the amplifier on for a session, and off after it."""
         if on is not self._driven:
             self._driven = on
             self._start()

@@ -96,7 +96,6 @@ class ZenohNetwork(PlantNetwork):
 
     @property
     def link(self) -> ZenohLink | None:
-        """Link of the session's frames; None without a session."""
         return self._link
 
     # ── the loop's calls, in their order ──
@@ -128,14 +127,12 @@ class ZenohNetwork(PlantNetwork):
             role.event("started", f"{role.vehicle} is still tripped: {text}; `aeroloop op arm` clears it")
 
     def take_inbox(self) -> None:
-        """Process queued claims, releases and operator commands, and the status of another plant."""
         if time.monotonic_ns() >= self._others_due:
             self._read_others()
         if self._role.take_inbox():
             self.follow_session()
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Write the trace row, measure the latency, publish events and a due status."""
         endpoint = self._endpoint
         self._trace.row(endpoint, measurement, arrival, sent_ns)
         if endpoint.outcome is Outcome.ACTED:
@@ -208,7 +205,6 @@ class ZenohNetwork(PlantNetwork):
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
     def leave(self) -> None:
-        """Publish the end of the trace, the stop and a last status."""
         self.follow_session()
         self._trace.finish()
         self._latch_file.wait()

@@ -23,9 +23,14 @@ import casadi as ca
 import numpy as np
 
 from aeroloop.plant_emulator.endpoint.endpoint import LimitSettings
-from aeroloop.plant_emulator.model.emulated import initially, step_function
-from aeroloop.plant_emulator.model.sensors import Sensors, sensor_function
-from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.model.emulated import (
+    Sensors,
+    Wind,
+    WindSettings,
+    initially,
+    sensor_function,
+    step_function,
+)
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, level, numbers, with_numbers
 from aeroloop.protocol.wire.spec import SignalSpec

@@ -15,8 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from aeroloop.plant_emulator.model.bodies import AeroSettings
-from aeroloop.plant_emulator.model.emulated import RotorSettings
-from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO, SensorSettings
+from aeroloop.plant_emulator.model.emulated import DAMPING_RATIO, RotorSettings, SensorSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings

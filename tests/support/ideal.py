@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from aeroloop.plant_emulator.model.bodies import AeroSettings
-from aeroloop.plant_emulator.model.emulated import FrictionSettings, RotorSettings
-from aeroloop.plant_emulator.model.sensors import SensorSettings
+from aeroloop.plant_emulator.model.emulated import FrictionSettings, RotorSettings, SensorSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.service.config import as_overrides
 

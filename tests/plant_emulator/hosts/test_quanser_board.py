@@ -16,8 +16,7 @@ import pytest
 
 from aeroloop.plant_emulator.hosts import quanser_board
 from aeroloop.plant_emulator.hosts.quanser_board import QuanserError, QuanserPlant
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.model.sensors import SensorSettings
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
 from aeroloop.protocol.messages.models import Grant

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed
-from aeroloop.plant_emulator.model.wind import WindSettings
+from aeroloop.plant_emulator.model.emulated import WindSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, PlantChangeKind

@@ -10,8 +10,14 @@ from math import atan2, cos, exp, hypot, pi, sin, sqrt
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.sensors import DAMPING_RATIO, FilteredDerivative, Sensors, SensorSettings
-from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.model.emulated import (
+    DAMPING_RATIO,
+    FilteredDerivative,
+    Sensors,
+    SensorSettings,
+    Wind,
+    WindSettings,
+)
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
 from tests.support.numpy_twin import Array
 

@@ -6,7 +6,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from aeroloop.plant_emulator.model.sensors import rate_of
+from aeroloop.plant_emulator.model.emulated import rate_of
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.theorem.plant_bounds import PlantBounds, plant_bounds
 
