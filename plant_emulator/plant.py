@@ -1,8 +1,7 @@
 """Plant interface: actuate, advance, measure and close; and the check of a user's own class behind it.
 
 The emulated plant, the USB board and a user's own class implement it; `plant.kind = "package.module:Class"` names the
-latter. The endpoint calls actuate → advance → measure once a tick. Frames, claims, watchdog, limits and faults are the
-endpoint's and the same for every plant. `aeroloop show examples own_plant.py` prints a plant to begin with.
+latter. The endpoint calls actuate → advance → measure once a tick; `aeroloop show examples own_plant.py` prints one.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from math import hypot, isfinite
+from textwrap import shorten
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError, create_model
@@ -26,8 +26,6 @@ T = TypeVar("T")
 EMULATED: Final = ("aero", "rigid_body")
 """Kinds that are not a class but a body of the emulated plant."""
 
-GROUP: Final = "aeroloop.plants"
-
 BUILT_IN: Final = {
     **dict.fromkeys(EMULATED, "aeroloop.plant_emulator.model.emulated:EmulatedPlant"),
     "mujoco": "aeroloop.plant_emulator.engines.mujoco:MujocoPlant",
@@ -36,8 +34,7 @@ BUILT_IN: Final = {
 
 _SIGNALS: Final[TypeAdapter[Signals]] = TypeAdapter(Signals)
 
-_UNIT: Final = 0.01
-"""A quaternion that is this much longer or shorter than 1 is none: values in another order or unit, or a drift."""
+_UNIT: Final = 0.01  # a quaternion so much longer or shorter than 1 is none: another order or unit, or a drift
 
 
 class PlantError(AeroloopError):
@@ -57,9 +54,8 @@ class Measurement(NamedTuple):
 class State(NamedTuple):
     """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V].
 
-    `signals` are up to 16 further quantities of the plant by name: wheel speeds, a battery, a temperature. A name has
-    letters, digits and underscores, and ends in its unit (`wheel_1_rad_s`); NaN where a value is not known. They
-    reach the log, the page of a review and the export; no controller receives them.
+    `signals` are up to 16 further quantities by name, such as a battery's or wheel speeds, NaN where not known. A name
+    has letters, digits and underscores, and ends in its unit (`wheel_1_rad_s`). No controller receives them.
     """
 
     attitude: Quaternion
@@ -129,16 +125,11 @@ class Plant(ABC):
 
 def class_of(kind: str) -> type[Plant]:
     """The class that `plant.kind` names. Raises PluginError."""
-    return plugins.find("plant.kind", kind, GROUP, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
+    return plugins.find("plant.kind", kind, "aeroloop.plants", BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
 
 
 def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: float) -> OwnPlant:
-    """Make the plant that `plant.kind` names, with the settings `own`; at most `voltage_limit` [V] reaches it.
-
-    Raises:
-        PluginError: There is no such class.
-        PlantError: Its settings are wrong, its constructor failed, or it has no usable number of motors.
-    """
+    """Make the plant that `plant.kind` names, with the settings `own`. Raises PluginError, PlantError."""
     found = class_of(kind)
     section = create_model("Section", own=(found.Settings, ...))
     whole = create_model("Configured", plant=(section, ...))  # so that a wrong key is named in full
@@ -168,27 +159,22 @@ class OwnPlant(Plant):
         self.paces = plant.paces
         count = getattr(plant, "actuators", None)
         if not (isinstance(count, int) and 1 <= count <= MAX_ACTUATORS):
-            raise self._failure(
-                f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}", type(plant)
-            )
+            what = f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}"
+            raise self._failure(what, type(plant))
         self.actuators = count
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""
         limit = self._limit
         self._call(self._plant.actuate, tuple(max(-limit, min(limit, volts)) for volts in voltages))
 
     def enable(self, on: bool) -> None:
-        """Switch its power stage."""
         self._call(self._plant.enable, on)
 
     def advance(self) -> None:
-        """Let one period pass."""
         self._call(self._plant.advance)
         self.passed, self.note = self._plant.passed, self._plant.note
 
     def measure(self) -> Measurement:
-        """The sensors' present values."""
         measured = self._call(self._plant.measure)
         try:
             (w, x, y, z), (a, b, c) = (map(float, part) for part in measured)
@@ -197,13 +183,11 @@ class OwnPlant(Plant):
             raise self._failure(f"measured {_shown(measured)}: {form}", self._plant.measure) from None
         length = hypot(w, x, y, z)
         if isfinite(length) and abs(length - 1) > _UNIT:
-            raise self._failure(
-                f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)", self._plant.measure
-            )
+            what = f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)"
+            raise self._failure(what, self._plant.measure)
         return Measurement((w, x, y, z), (a, b, c))
 
     def truth(self) -> State | None:
-        """The true state; None where the plant has none to give, such as hardware."""
         true = self._call(self._plant.truth)
         if true is None:
             return None
@@ -215,18 +199,15 @@ class OwnPlant(Plant):
             form = "truth() must return State((w, x, y, z), (x, y, z), voltages, {'a_name': value, …}) or None"
             raise self._failure(f"gave {_shown(true)}: {form}", self._plant.truth) from None
         if len(voltages) != self.actuators:
-            raise self._failure(
-                f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators", self._plant.truth
-            )
+            what = f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators"
+            raise self._failure(what, self._plant.truth)
         known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
         return State((w, x, y, z), (a, b, c), tuple(voltages), signals) if known else None
 
     def close(self) -> None:
-        """Set 0 V, and release its resources; after a failure as far as that is possible."""
         if self._closed:
             return
-        self._closed = True
-        failed = self._failed
+        self._closed, failed = True, self._failed
         try:
             self._call(self._plant.close)
         except PlantError:
@@ -246,5 +227,4 @@ class OwnPlant(Plant):
 
 
 def _shown(value: object) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:80]}…"
+    return shorten(repr(value), 80, placeholder="…")

@@ -56,13 +56,13 @@ class Notice(NamedTuple):
 class Freshness:
     """Judge of a session's commands: which of them are fresh, and whether the next one is overdue.
 
-    A command echoes the counter of the measurement that it answers, which gives its age in ticks: no clocks of two
-    hosts are compared. The wait for the next command is measured on the clock of the judge's owner [ns]: the Endpoint's
-    is its tick index times the period, the Relay's is monotonic.
+    A command echoes the counter of the measurement that it answers, which gives its age in ticks. The wait for the next
+    command is measured on the owner's clock [ns]: the Endpoint's is its tick index times the period, the Relay's is
+    monotonic.
 
-    Why the first command of a session has a deadline of its own: the age of an echo is known modulo the counter.
-    Commands late by a whole round of the counter would look fresh, so the first one must be received before the
-    counter is back at 0. A counter shorter than twice the watchdog's time cannot detect this, and gets the usual time.
+    Why the first command of a session has a deadline of its own: commands late by a whole round of the counter would
+    look fresh, so the first one must be received before the counter is back at 0. A counter shorter than twice the
+    watchdog's time cannot detect this, and gets the usual time.
 
     Attributes:
         answered, echo: Session tick that the last fresh command answers, and its counter; −1 for none.
@@ -116,8 +116,6 @@ class Freshness:
 class VehicleClaim:
     """A plant that one controller at a time may drive: base of the Endpoint and of the CAN bridge's Relay.
 
-    `watchdog_s` is the longest time without a fresh command [s]; if `armed`, the first claim is granted without `arm`.
-
     Attributes:
         trip: Cause of the last trip, until it is cleared.
         cause: Why the latch refuses claims, or None.
@@ -158,7 +156,7 @@ class VehicleClaim:
 
     @property
     def state(self) -> PlantState:
-        """State of the plant: idle, granted, driven or tripped."""
+        """Idle, granted, driven or tripped."""
         return self._machine.state
 
     @property
@@ -268,7 +266,7 @@ class VehicleClaim:
             self._trip(cause, reason)
 
     def record_change(self, kind: PlantChangeKind, **what: Any) -> None:
-        """Record a change of this end after its last tick; fields as in PlantChange."""
+        """Record a change after the last tick; fields as in PlantChange."""
         self.changes.append(PlantChange(tick=self.ticked, kind=kind, **what))
 
     # ── commands ──
@@ -298,16 +296,14 @@ class VehicleClaim:
             self._machine.fire(PlantTrigger.COMMAND)
         return Outcome.ACTED
 
-    def _may_be_invalid(self, echo: int) -> bool:
+    def _may_be_invalid(self, echo: int) -> bool:  # noqa: ARG002  # the relay has no measurements to judge by
         """Whether a command without a valid value that answers this measurement means 0 V, or trips."""
-        del echo
         return True
 
     # ── begin and end of a session ──
 
     def _begin(self) -> None:
-        """Begin a session; its first measurement is the next tick's."""
-        self._start = self.ticked + 1
+        self._start = self.ticked + 1  # of its first measurement
 
     def _trip(self, cause: TripCause, reason: str) -> None:
         self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
@@ -439,19 +435,16 @@ class Endpoint(VehicleClaim):
             self._trip(*trip)
             self.plant.actuate(self._faults.voltages(self.voltages))
             return None
-        codes = self._encoded(seen)
-        self._invalid[self.counter] = codes is self._no_measurement
+        codes = self._no_measurement
+        if valid := isfinite(sum(seen.attitude) + sum(seen.rate)):
+            values = (*sent_vector(seen.attitude), *seen.rate)
+            codes = [quantizer.encode(value) for quantizer, value in zip(self._quantizers, values, strict=True)]
+        self._invalid[self.counter] = not valid
         return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else UNCHANGED
 
     @property
     def _now_ns(self) -> int:
         return self.ticked * self.period_ns
-
-    def _encoded(self, seen: Measurement) -> list[float]:
-        values = (*sent_vector(seen.attitude), *seen.rate)
-        if not isfinite(sum(seen.attitude) + sum(seen.rate)):
-            return self._no_measurement
-        return [quantizer.encode(value) for quantizer, value in zip(self._quantizers, values, strict=True)]
 
     def _may_be_invalid(self, echo: int) -> bool:
         return any(self._invalid[(echo - ago) % self._counters] for ago in range(self._forgiven + 1))
@@ -531,20 +524,15 @@ class LimitSettings(BaseModel, extra="forbid"):
 
 
 class LimitMonitor:
-    """Checks one plant against its limits once a tick, by its own sensors; durations are counted in ticks.
-
-    At `voltage_limit` [V] a motor counts as saturated.
-    """
+    """Checks a plant once a tick, by its own sensors; at `voltage_limit` [V] a motor counts as saturated."""
 
     def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
-        self._settings = settings
-        self._period_ns = period_ns
-        self._full = voltage_limit
+        self._settings, self._period_ns, self._full = settings, period_ns, voltage_limit
         self._least_upright = cos(radians(settings.max_tilt_deg))
         self.reset()
 
     def reset(self) -> None:
-        """Reset the counts for a new session."""
+        """Begin a session."""
         self._saturated = self._invalid = 0
 
     def check(self, seen: Measurement, voltages: Sequence[float]) -> tuple[TripCause, str] | None:

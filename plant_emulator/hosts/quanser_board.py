@@ -1,12 +1,11 @@
 """Quanser Aero on its USB board: a plant, by Quanser's HIL interface.
 
-The board samples by its own clock and `advance` waits for the next sample, so the board paces the loop. A measurement
-is this period's sample or NaN; a failed read never repeats the last one. Each good sample reloads the board's watchdog,
-which on expiry sets 0 V and switches the amplifier off. It is not reloaded after a failed read or write, so that a
-plant that cannot be commanded soon has 0 V. An expired watchdog is cleared only while 0 V is commanded.
+The board paces the loop: `advance` waits for its next sample, which is measured; a failed read measures NaN. Each good
+sample reloads the board's watchdog, which on expiry sets 0 V and switches the amplifier off. It is not reloaded after a
+failed read or write, so that a plant that cannot be commanded soon has 0 V, and cleared only while 0 V is commanded.
 
-The interface is part of Quanser's SDK and is imported when a plant is made. It passes arrays to C as bare memory, so
-their types are part of the call: channels uint32, analog and other float64, encoder counts int32, digital lines int8.
+Quanser's interface passes arrays to C as bare memory, so their types are part of the call: channels uint32, analog and
+other float64, encoder counts int32, digital lines int8.
 """
 
 from __future__ import annotations
@@ -45,13 +44,12 @@ class QuanserError(AeroloopError):
 class QuanserPlant(Plant):
     """The Aero on its board. Its encoders are relative: keep the Aero level and at yaw 0 while this object is made.
 
-    Each `advance` is one period [s]. After a late call the newest sample is measured, `passed` is the number of periods
-    that passed, and the next `passed` − 1 calls return at once and measure NaN. `watchdog_s` is the board's [s].
-    `failures` counts failed calls, reads without a sample and expiries of the watchdog; `note` has the last one.
+    After a late `advance` the newest sample is measured, `passed` is the number of periods that passed, and the next
+    `passed` − 1 calls return at once and measure NaN. `failures` counts failed calls, reads without a sample and
+    expiries of the watchdog.
 
     Raises:
-        QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`,
-            `advance` or `enable`, it cannot be started.
+        QuanserError: The interface is missing, or the board cannot be opened, prepared or, at the first call, started.
     """
 
     actuators = 2
@@ -68,7 +66,7 @@ class QuanserPlant(Plant):
                 f"Quanser's Python interface is missing ({error}): install the Quanser SDK, then in this environment "
                 "`pip install --find-links <SDK's folder>/python quanser_api`"
             ) from error
-        self._error: type[Exception] = self._hardware.HILError
+        self._error: Any = self._hardware.HILError
         self._board: Any = self._hardware.HIL()
         self.failures = 0
 
@@ -99,10 +97,7 @@ class QuanserPlant(Plant):
     # ── Plant ──
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Hold voltages [V], clipped to the limit; NaN is 0 V. Shape (2,).
-
-        An expired board watchdog is cleared by 0 V only; until then nothing is written.
-        """
+        """NaN is 0 V. An expired board watchdog is cleared by 0 V only; until then nothing is written."""
         limit = self._settings.voltage_limit
         self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
         self._start()
@@ -110,7 +105,6 @@ class QuanserPlant(Plant):
             self._write_outputs()
 
     def advance(self) -> None:
-        """Wait for the board's next sample; a failed read takes a period, too."""
         if self._owed:
             self._owed -= 1
             self._measurement = NO_MEASUREMENT
@@ -142,10 +136,7 @@ class QuanserPlant(Plant):
                 self._write_outputs()
 
     def close(self) -> None:
-        """Set 0 V, switch the amplifier off, and close the board. A failed step does not prevent the next.
-
-        If neither 0 V nor amplifier-off could be written, the watchdog is left running, so that it expires.
-        """
+        """A failed step does not prevent the next. If neither write succeeds, the watchdog is left to expire."""
         if self._closed:
             return
         self._closed = True
@@ -191,22 +182,19 @@ class QuanserPlant(Plant):
         try:
             yield
         except self._error as error:
-            raise QuanserError(f"{what_fails}: {_text(error)}{hint}") from error
+            raise QuanserError(f"{what_fails}: {error.get_error_message()}{hint}") from error
 
     # ── samples ──
 
     def _read(self) -> int:
         """Wait for the newest sample. Returns the periods that passed, or 0 if the read failed."""
-        board = self._board
-        try:
-            if board.task_read(self._task, 1, None, self._counts, None, self._gyro) != 1:
-                self._failed("the board's task gave no sample")
-                return 0
-        except self._error as error:
-            self._failed(_text(error))
+        samples = self._try(self._board.task_read, self._task, 1, None, self._counts, None, self._gyro)
+        if samples == 0:
+            self._failed("the board's task gave no sample")
+        if not samples:
             return 0
         with suppress(self._error):  # not every board may count them
-            self._lost_samples = board.task_get_buffer_overflows(self._task)
+            self._lost_samples = self._board.task_get_buffer_overflows(self._task)
         self._read_samples += 1
         before, self._index = self._index, self._read_samples + self._lost_samples
         return max(1, self._index - before)  # a failed read counted as a period, even if its sample followed
@@ -234,14 +222,16 @@ class QuanserPlant(Plant):
         self._write_motors(self._held if self._driven else OFF)
 
     def _write_motors(self, voltages: Sequence[float]) -> bool:
-        done = self._try(self._board.write_analog, MOTORS, 2, np.multiply(self._settings.motor_signs, voltages))
-        self._written &= done
-        return done
+        return self._write(self._board.write_analog, np.multiply(self._settings.motor_signs, voltages))
 
     def _write_amplifier(self, on: bool) -> bool:
-        done = self._try(self._board.write_digital, MOTORS, 2, np.full(2, on, dtype=np.int8))
+        done = self._write(self._board.write_digital, np.full(2, on, dtype=np.int8))
         if done:
             self._amplified = on
+        return done
+
+    def _write(self, call: Callable[..., object], values: Any) -> bool:
+        done = self._try(call, MOTORS, 2, values) is not None
         self._written &= done
         return done
 
@@ -249,12 +239,9 @@ class QuanserPlant(Plant):
         """Reload the watchdog or read its state. False if it has expired or cannot be read."""
         if self._expired:
             return False
-        try:
-            alive: bool = self._board.watchdog_reload() if reload else not self._board.watchdog_is_expired()
-        except self._error as error:
-            self._failed(_text(error))
-            return False
-        if not alive:
+        answer = self._try(self._board.watchdog_reload if reload else self._board.watchdog_is_expired)
+        alive = answer is not None and bool(answer) is reload  # a reload returns whether it had not expired
+        if answer is not None and not alive:
             self._failed("the board's watchdog expired")
             self._expired, self._amplified = True, False
         return alive
@@ -263,7 +250,7 @@ class QuanserPlant(Plant):
         """Clear the expired watchdog and restart it with outputs at 0 V. False if a step failed."""
         self._unlock()
         # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
-        armed = self._try(self._board.watchdog_start, self._watchdog_s)
+        armed = self._try(self._board.watchdog_start, self._watchdog_s) is not None
         still = self._write_motors(OFF)
         off = self._write_amplifier(False)
         self._expired = not (armed and still and off)
@@ -275,18 +262,15 @@ class QuanserPlant(Plant):
             with suppress(self._error):  # a watchdog that has not expired may refuse to be cleared
                 call()
 
-    def _try(self, call: Callable[..., object], *args: object) -> bool:
+    def _try(self, call: Callable[..., object], *args: object) -> Any:
+        """The call's result, True where it has none; None if the call failed."""
         try:
-            call(*args)
+            result = call(*args)
         except self._error as error:
-            self._failed(_text(error))
-            return False
-        return True
+            self._failed(error.get_error_message())
+            return None
+        return True if result is None else result
 
     def _failed(self, text: str) -> None:
         self.failures += 1
         self.note = f"the board: {self.failures} failed calls, the last: {text}"
-
-
-def _text(error: Any) -> str:
-    return str(error.get_error_message())
