@@ -22,7 +22,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.faults.injection import Faults, FaultTransition
+from aeroloop.plant_emulator.faults.injection import Faults, Transition
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import (
@@ -475,7 +475,7 @@ class Endpoint(VehicleClaim):
         for name in names:
             self.record_change("inject", name=name)
         done = ["no faults any more" if name is None else f"fault injected: {name}" for name in names]
-        self._note_faults([FaultTransition(self._faults.ticks, text) for text in done])
+        self._note_faults([(self._faults.ticks, text) for text in done])
         return done
 
     def fault_statuses(self) -> list[FaultStatus]:
@@ -496,13 +496,13 @@ class Endpoint(VehicleClaim):
             session_tick=None if self.session is None else self.session_tick,
         )
 
-    def _note_faults(self, transitions: Sequence[FaultTransition]) -> None:
+    def _note_faults(self, transitions: Sequence[Transition]) -> None:
         """Queue events of faults, with the session's tick if there was one then."""
-        for transition in transitions:
+        for at, text in transitions:
             tick = self.event_tick
             if tick is not None:
-                tick = max(0, tick + transition.tick - self._faults.ticks)
-            self.notices.append(Notice("fault", transition.text, self.session, tick))
+                tick = max(0, tick + at - self._faults.ticks)
+            self.notices.append(Notice("fault", text, self.session, tick))
 
 
 # ── limits ──

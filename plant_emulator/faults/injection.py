@@ -2,10 +2,8 @@
 
 The endpoint asks `Faults`: motor faults change the voltages at the start of a period, sensor faults the sample at its
 end, and `passes` takes the frames of either direction. Faults on one signal act one after another, in the order of
-injection. Each has its own random numbers, so that another fault leaves its noise unchanged.
-
-Times are the plant's, whole numbers of periods rounded to the nanosecond: a fault starts at exactly the tick of its
-start time. So the ticks of its begin and end follow from the fault and the tick of its injection alone.
+injection. Each has its own random numbers, so that another fault leaves its noise unchanged. Times are the plant's,
+whole numbers of periods rounded to the nanosecond: a fault starts at exactly the tick of its start time.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from math import ceil, cos, hypot, inf, nan, sin
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -24,18 +22,13 @@ from aeroloop.protocol.messages.models import FaultStatus
 MAX_FAULTS: Final = 64
 """Faults that may act or be to come at the same time; as many that are over are remembered."""
 
-GARBLED_RATE: Final = 10.0
-"""Bound of a garbled angular velocity about each axis, ± [rad/s]."""
+GARBLED_RATE: Final = 10.0  # bound of a garbled angular velocity about each axis, ± [rad/s]
 
+Random: TypeAlias = np.random.Generator
 Source: TypeAlias = Literal["configured", "injected"]
 Values: TypeAlias = tuple[float, ...]
-
-
-class FaultTransition(NamedTuple):
-    """A fault's begin, end or injection: when, in ticks of the plant's time, and one line that says what."""
-
-    tick: int
-    text: str
+Transition: TypeAlias = tuple[int, str]
+"""A fault's begin, end or injection: when, in ticks of the plant's time, and one line that says what."""
 
 
 def first_tick(time_s: float, period: float) -> int:
@@ -60,14 +53,7 @@ class ActingFault:
     """
 
     def __init__(
-        self,
-        fault: Fault,
-        source: Source,
-        random: np.random.Generator,
-        period: float,
-        now: float,
-        last: Any,
-        bound: float = 0.0,
+        self, fault: Fault, source: Source, random: Random, period: float, now: float, last: Any, bound: float
     ) -> None:
         self.fault, self.source, self.kind, self.value = fault, source, fault.kind, fault.value or 0.0
         self.begin = first_tick(round(fault.start_s + now, 9), period)
@@ -81,29 +67,28 @@ class ActingFault:
         self._parts = range(self._size) if part is None else (part,)
         self._earlier: deque[tuple[float, Values]] = deque([] if last is None else [(-inf, last)])  # for a delay
 
-    def active(self, tick: int) -> bool:
-        """Whether it is at work at a tick."""
+    def _active(self, tick: int) -> bool:
         return self.begin <= tick < self.end
 
-    def acts(self, tick: int) -> bool:
+    def _acts(self, tick: int) -> bool:
         """Whether it changes one sample or frame at a tick, which is counted; where by chance, chance decides."""
-        acts = self.active(tick) and (self.kind not in BY_CHANCE or bool(self._random.random() < self.value))
+        acts = self._active(tick) and (self.kind not in BY_CHANCE or bool(self._random.random() < self.value))
         self.changed += acts
         return acts
 
-    def transitions(self, now: int) -> list[FaultTransition]:
-        """Its begin and end up to tick `now`, unless returned before."""
+    def transitions(self, now: int) -> list[Transition]:
+        """Begin and end up to tick `now`, unless returned before."""
         found, fault = [], f"({self.source}): {self.fault}"
         if not (self.begun or self.over) and self.begin <= now:
             self.begun = True
-            found.append(FaultTransition(self.begin, f"fault begins {fault}"))
+            found.append((self.begin, f"fault begins {fault}"))
         if self.begun and not self.over and self.end <= now:
             self.over = True
-            found.append(FaultTransition(int(self.end), f"fault ends {fault}, {self.changed} {self.fault.effect}"))
+            found.append((int(self.end), f"fault ends {fault}, {self.changed} {self.fault.effect}"))
         return found
 
     def status(self, first: int | None) -> FaultStatus:
-        """Its status; `first` is the plant's tick at which its time began, None if it has not."""
+        """Status; `first` is the plant's tick at which its time began, None if it has not."""
         return FaultStatus(
             fault=str(self.fault),
             source=self.source,
@@ -121,10 +106,10 @@ class ActingFault:
             self._earlier.append((t, given))
             while len(self._earlier) > 1 and self._earlier[1][0] <= round(t - self.value, 9):
                 self._earlier.popleft()
-        if not self.active(tick):
+        if not self._active(tick):
             self._last = given
             return given
-        if not self.acts(tick):
+        if not self._acts(tick):
             return given
         match self.kind:
             case "off" | "drop":
@@ -164,13 +149,13 @@ class ActingFault:
         passed: list[bytes] = []
         match self.kind:
             case "off" | "drop":
-                return [frame for frame in given if not self.acts(tick)]
+                return [frame for frame in given if not self._acts(tick)]
             case "duplicate":
                 again = [frame for _, frame in self.held]
-                self.held = deque((t, frame) for frame in given if self.acts(tick))
+                self.held = deque((t, frame) for frame in given if self._acts(tick))
                 return again + given
             case "delay":  # when it ends, all held frames pass at once, ahead of the newer ones
-                active = self.active(tick)
+                active = self._active(tick)
                 self.changed += active * len(given)
                 self.held.extend((round(t + self.value, 9), frame) for frame in given)
                 while self.held and (not active or self.held[0][0] <= t):
@@ -178,14 +163,14 @@ class ActingFault:
                 return passed
         for frame in given:
             if self.kind == "garble":
-                passed.append(self._garbled(frame) if frame and self.acts(tick) else frame)
+                passed.append(self._garbled(frame) if frame and self._acts(tick) else frame)
             elif self.kind == "stuck":
-                if not self.acts(tick) or self._last is None:
+                if not self._acts(tick) or self._last is None:
                     self._last = frame
                 passed.append(self._last)
             elif self.held:  # reorder
                 passed += [frame, self.held.popleft()[1]]
-            elif self.acts(tick):
+            elif self._acts(tick):
                 self.held.append((t, frame))
             else:
                 passed.append(frame)
@@ -216,11 +201,8 @@ def _rotated(q: Values, error: Sequence[float]) -> Values:
 class Faults:
     """Faults of one plant's sensors, motors and frames. Before `start` none acts.
 
-    `period` is the time of one `advance` [s], `voltage_limit` the largest voltage of a garbled command [V]; `seed` is 0
-    or more.
-
-    Attributes:
-        ticks: Periods since `start`; −1 before.
+    `period` is the time of one `advance` [s], `voltage_limit` the largest voltage of a garbled command [V]. `ticks` are
+    the periods since `start`, −1 before.
     """
 
     def __init__(self, actuators: int, period: float, *, voltage_limit: float = 24.0, seed: int = 0) -> None:
@@ -247,7 +229,7 @@ class Faults:
 
     # ── injection ──
 
-    def inject(self, faults: Sequence[Fault], source: Source, *, clear: bool = False) -> list[FaultTransition]:
+    def inject(self, faults: Sequence[Fault], source: Source, *, clear: bool = False) -> list[Transition]:
         """Add faults with start and end counted from now; if `clear`, remove all others first.
 
         The current sample stays unchanged; frames that a removed fault holds back are lost.
@@ -270,27 +252,24 @@ class Faults:
         forgotten = over[: max(0, len(over) + len(faults) - MAX_FAULTS)]
         self._known = [each for each in self._known if each not in forgotten]
         for fault in faults:
-            acting = self._at_work(fault, source)
-            self._acting[fault.target.whole].append(acting)
+            whole, seen = fault.target.whole, self._seen
+            of_frames = whole in ("measurement", "command")
+            number = self._injected[whole] if of_frames else self._injected.total()
+            self._injected[whole] += 1
+            # The signal's name is part of the seed, so that the two streams do not lose the same ticks.
+            random = np.random.default_rng([self._seed, number, *fault.signal.encode()])
+            last: Any = seen and (seen.attitude if whole == "attitude" else seen.rate)
+            if of_frames:
+                last = self._last_frame.get(whole)
+            elif whole == "motors":
+                last = self._applied
+            bound = self._limit if whole == "motors" else GARBLED_RATE
+            acting = ActingFault(fault, source, random, self._period, self.time, last, bound)
+            self._acting[whole].append(acting)
             self._known.append(acting)
         return ends
 
-    def _at_work(self, fault: Fault, source: Source) -> ActingFault:
-        whole, seen = fault.target.whole, self._seen
-        of_frames = whole in ("measurement", "command")
-        number = self._injected[whole] if of_frames else self._injected.total()
-        self._injected[whole] += 1
-        # The signal's name is part of the seed, so that the two streams do not lose the same ticks.
-        random = np.random.default_rng([self._seed, number, *fault.signal.encode()])
-        last: Any = seen and (seen.attitude if whole == "attitude" else seen.rate)
-        bound = GARBLED_RATE
-        if of_frames:
-            last = self._last_frame.get(whole)
-        elif whole == "motors":
-            last, bound = self._applied, self._limit
-        return ActingFault(fault, source, random, self._period, self.time, last, bound)
-
-    def _clear(self) -> list[FaultTransition]:
+    def _clear(self) -> list[Transition]:
         self._known = [each for each in self._known if each.begun]
         for each in self._known:
             if not each.over:
@@ -300,10 +279,10 @@ class Faults:
         self._applied = self._commanded
         return self.transitions()
 
-    def transitions(self) -> list[FaultTransition]:
+    def transitions(self) -> list[Transition]:
         """Begins and ends up to now that were not returned before, in order of time."""
         found = [transition for each in self._known for transition in each.transitions(self.ticks)]
-        return sorted(found, key=lambda transition: transition.tick)
+        return sorted(found, key=lambda transition: transition[0])
 
     def statuses(self, first: int | None) -> list[FaultStatus]:
         """Status of every fault in order; `first` is the plant's tick at `start`, None if there was none."""

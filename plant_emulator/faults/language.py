@@ -6,8 +6,8 @@ once, without an end for ever:
     attitude:off@5    rate.y:bias=0.1@2..4    motor2:stuck@3    command:drop=0.05    measurement:delay=0.02@0..10
 
 `attitude` and `rate` take an axis of the body, `.x .y .z`; bias and noise of the attitude are rotations about the
-body's axes. Motors are numbered from 1 in the order of the commanded voltages; `motors` fails all of them at the same
-times. README.md has the limits of the values, with their reasons. `injection` puts faults to work.
+body's axes. Motors are numbered from 1; `motors` fails all of them at the same times. README.md has the limits of the
+values, with their reasons.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_DELAY_S: Final = 10.0
 MAX_TIME_S: Final = 1e8
 """Latest begin and end [s]; three years."""
 
-KINDS: Final = {
+KINDS: Final = {  # what each changes things into
     "off": "dropped",  # a sensor without a valid value, a motor at 0 V; no frame passes
     "stuck": "replaced by the last",  # the values, voltage or frame before the fault; a frame for each new one
     "bias": "shifted",  # the value is added [rad, rad/s, V]
@@ -35,14 +35,12 @@ KINDS: Final = {
     "duplicate": "duplicated",  # by chance a frame passes again a tick later
     "reorder": "reordered",  # by chance a frame passes after the next one
 }
-"""Every kind by its name in a fault: what it changes things into."""
-
 BY_CHANCE: Final = ("drop", "garble", "duplicate", "reorder")
 """Kinds whose value is a probability."""
 
 
 class Signal(NamedTuple):
-    """A signal that a fault can act on."""
+    """What a fault can act on."""
 
     whole: str  # sensor, motors or stream that it is, or is a part of
     part: int | None  # axis 0…2, or motor from 0; None for all of it
@@ -70,7 +68,6 @@ SIGNALS: Final[dict[str, Signal]] = {
     "measurement": Signal("measurement", None, _OF_FRAMES, "measurements"),
     "command": Signal("command", None, _OF_FRAMES, "commands"),
 }
-"""Every signal by its name in a fault."""
 
 
 class FaultError(AeroloopError, ValueError):

@@ -1,8 +1,4 @@
-"""Loop of the plant end, for any plant and any network: wait → receive → tick → send → account.
-
-A computed plant waits for the tick grid; with hardware `advance` blocks until the next sample; in lockstep the loop
-waits for the answer to its last measurement, so that a run repeats bit for bit.
-"""
+"""Loop of the plant end, for any plant and any network: wait → receive → tick → send → account."""
 
 from __future__ import annotations
 
@@ -33,9 +29,8 @@ class PlantNetwork(ABC):
 
     Attributes:
         timing: Timing of the driver's loop; None in lockstep.
-        skipped: Ticks of sessions that the driver missed.
+        skipped, sent: Ticks of sessions that the driver missed, and measurement frames sent, so far.
         notes: What a status says of the machine, such as real-time settings that it refused.
-        sent: Measurement frames sent; not UNCHANGED, which is sent in lockstep only.
         steps: Steps that lockstep may still take; None for no limit.
     """
 
@@ -80,7 +75,11 @@ class PlantNetwork(ABC):
 
 
 class Driver:
-    """Runs the loop of a plant end until `stop` is set."""
+    """Runs the loop of a plant end until `stop` is set.
+
+    A computed plant waits for the tick grid; with hardware `advance` blocks until the next sample; in lockstep the loop
+    waits for the answer to its last measurement, so that a run repeats bit for bit.
+    """
 
     def __init__(
         self, endpoint: Endpoint, network: PlantNetwork, loop: LoopSettings, stop: threading.Event, clock: Clock = time
@@ -89,11 +88,7 @@ class Driver:
         self._counter = 0  # of the measurement sent last
 
     def run(self) -> None:
-        """Run until `stop` is set or the plant fails; then close the plant at 0 V and leave the network.
-
-        Raises:
-            PlantError: A plant of one's own failed; the loop has tripped and says so.
-        """
+        """Run, then close the plant at 0 V and leave the network. Raises PlantError if the plant failed; it tripped."""
         self._network.serve()
         try:
             if self._loop.lockstep:
@@ -110,7 +105,6 @@ class Driver:
                 self._network.leave()
 
     def _run_real_time(self) -> None:
-        """Wait for a tick, receive, tick and send, account; a plant that paces the loop waits in `advance`."""
         network, endpoint, plant = self._network, self._endpoint, self._endpoint.plant
         network.notes = prepare_process(self._loop)
         timing = network.timing = LoopTiming(clock=self._clock)
@@ -136,7 +130,6 @@ class Driver:
             timing.done()
 
     def _run_lockstep(self) -> None:
-        """Tick and send, then wait for the answer, which is the next tick's command."""
         network, arrival = self._network, None
         while not self._stop.is_set():
             network.take_inbox()

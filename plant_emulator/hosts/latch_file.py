@@ -1,7 +1,6 @@
-"""Latch file: keeps a plant's trip or stop on disk, so that it outlives the plant's process.
+"""Latch file: keeps a plant's trip or stop on disk while it lasts, so that it outlives the plant's process.
 
-One JSON file for each vehicle in a state directory. It is there while the plant is tripped. A thread of its own writes
-and removes it: a disk may take seconds, and neither 0 V nor the loop waits for it.
+A thread of its own writes and removes the file: a disk may take seconds, and neither 0 V nor the loop waits for it.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ RETRY_S: Final = 5.0
 
 
 class Latch(BaseModel, frozen=True, extra="forbid"):
-    """Why a plant refuses claims: the latch's cause, its text with the operator's name, what clears it."""
+    """Why a plant refuses claims: `text` has the operator's name, `operator_only` is what clears it."""
 
     cause: TripCause
     text: str
@@ -91,12 +90,10 @@ class LatchFile:
     def _run(self) -> None:
         while True:
             with self._changed:
-                new = self._changed.wait_for(
-                    lambda: self._wanted != self._kept and self._error is None, RETRY_S if self._error else None
-                )
+                retry_s = RETRY_S if self._error else None
+                self._changed.wait_for(lambda: self._wanted != self._kept and self._error is None, retry_s)
                 latch = self._wanted
-            if new or self._error:
-                self._attempt(latch)
+            self._attempt(latch)
 
     def _attempt(self, latch: Latch | None) -> None:
         error = None

@@ -65,15 +65,10 @@ class PlantTrace:
     """
 
     def __init__(
-        self,
-        wire: WireSpec,
-        publish: Callable[[bytes], None],
-        run: int | None = None,
-        clock: Clock = time,
+        self, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None, clock: Clock = time
     ) -> None:
         self._publish, self._clock = publish, clock
-        run = secrets.randbits(64) if run is None else run
-        self._writer = TraceWriter("plant", wire, run)
+        self._writer = TraceWriter("plant", wire, secrets.randbits(64) if run is None else run)
 
     def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Add the row of the last tick, and publish a batch that is due. Nothing without a session."""
@@ -150,12 +145,7 @@ class _StoppedError(Exception):
 
 
 class PlantReplay:
-    """Replays one process of an emulated plant, from its settings and its trace.
-
-    Raises:
-        ValueError: The plant cannot be replayed, with the reason of `why_not`.
-        PlantError: It cannot be made.
-    """
+    """Replays one process of an emulated plant. Raises ValueError with the reason of `why_not`, or PlantError."""
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
         if reason := why_not(plant):
@@ -188,9 +178,8 @@ class PlantReplay:
 
     def result(self) -> PlantReplayed:
         """Result so far."""
-        return PlantReplayed(
-            ticks=self._ticks, differ=self._differ, first_difference=self._first, stopped=self._stopped
-        )
+        result = {"ticks": self._ticks, "differ": self._differ}
+        return PlantReplayed(**result, first_difference=self._first, stopped=self._stopped)
 
     def _check(self, header: Header) -> None:
         """Raise _StoppedError if a batch does not follow what was replayed."""
@@ -223,12 +212,8 @@ class PlantReplay:
 
     def _compare(self, session: str, logged: Any) -> None:
         """Compute a tick again, and compare its row."""
-        frames: dict[int, bytes | None] = {
-            Sent.FRAME: logged["command"].tobytes(),
-            Sent.SILENT: UNCHANGED,
-            Sent.NONE: None,
-        }
-        frame = frames.get(int(logged["received_as"]), bytes(self._wire.command.size + 1))
+        frames = {Sent.FRAME: logged["command"].tobytes(), Sent.SILENT: UNCHANGED, Sent.NONE: None}
+        frame = frames.get(logged["received_as"], bytes(self._wire.command.size + 1))
         measurement = self._endpoint.tick(frame, int(logged["tick"]))
         row = plant_row(self._endpoint, measurement, None, 0)
         computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]
@@ -254,12 +239,11 @@ class PlantReplay:
             if endpoint.session is not None:
                 raise _StoppedError(f"rows are missing before tick {change.tick}, where a session runs")
             endpoint.tick(None, change.tick)
-        name, reason = change.name or "", change.reason or ""
+        name, reason, cause = change.name or "", change.reason or "", change.cause or TripCause.OPERATOR
         match change.kind:
             case "claim":
                 assert change.claim is not None
-                answer = endpoint.claim(change.claim)
-                if isinstance(answer, Refusal):
+                if isinstance(answer := endpoint.claim(change.claim), Refusal):
                     raise _StoppedError(f"the claim after tick {change.tick} is refused: {answer.reason}")
             case "release":
                 endpoint.release(name)
@@ -268,11 +252,9 @@ class PlantReplay:
             case "lost":
                 endpoint.lost(name)
             case "stop":
-                assert change.cause is not None
-                endpoint.stop(change.cause, reason)
+                endpoint.stop(cause, reason)
             case "expire":
-                assert change.cause is not None
-                endpoint.expire(change.cause, reason)
+                endpoint.expire(cause, reason)
             case "inject":
                 endpoint.inject([Fault.parse(name)] if name else [], clear=not name)
         endpoint.changes.clear()

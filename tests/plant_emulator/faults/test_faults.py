@@ -57,8 +57,7 @@ class Faulty(RecordingPlant):
         return self.faults.passes("command", frame)
 
     def inject(self, *faults: str, clear: bool = False) -> list[tuple[int, str]]:
-        ends = self.faults.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
-        return [(end.tick, end.text) for end in ends]
+        return self.faults.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
 
 
 def sensed(*faults: str, ticks: int = 8, seed: int = 0) -> list[Measurement]:
@@ -287,7 +286,7 @@ def test_a_fault_acts_at_the_ticks_of_its_status_and_events_and_at_no_other(
     for k in range(round(0.7 / period)):
         acted.append(missing(plant.seen().rate))
         assert (plant.commands(b"a") == []) == acted[-1]
-        events += [transition.tick for transition in plant.faults.transitions()]
+        events += [tick for tick, _ in plant.faults.transitions()]
         assert acted[-1] == (start / 1000 <= round(k * period, 9) < (start + (length or 1000)) / 1000)
         plant.advance()
     for status in plant.faults.statuses(0):
