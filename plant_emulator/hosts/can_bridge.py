@@ -1,11 +1,8 @@
 """Bridge between Zenoh and a plant on a CAN bus.
 
-On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace. On
-the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its own watchdog besides the node's
-and trips when the bus fails or the node is silent, has another wire spec or trips. It reopens a failed bus by itself;
-the plant is driven again once it is armed.
-
-A tick of the bridge is a forwarded measurement. Commands are judged by the node's own rule, `Freshness`.
+On Zenoh it is the plant, on the bus the controller's side. Frames pass unchanged, byte for byte, and a tick is a
+forwarded measurement. It runs its own watchdog besides the node's and trips when the bus fails or the node is silent,
+has another wire spec or trips. It reopens a failed bus by itself; the plant is driven again once it is armed.
 """
 
 from __future__ import annotations
@@ -43,8 +40,7 @@ class Relay(VehicleClaim):
     def measurement(self, frame: bytes) -> bytes | None:
         """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick.
 
-        A session begins with counter 0; frames before it are of another session. A lost round of the counter goes
-        unnoticed.
+        A session begins with counter 0; frames before it are of another session.
         """
         if self.session is None:
             return None
@@ -90,7 +86,6 @@ class Relay(VehicleClaim):
         return True
 
     def _count(self, ticks: int) -> None:
-        """Count a tick, this many periods after the session's last one."""
         self.ticked += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
 
@@ -101,11 +96,7 @@ class Relay(VehicleClaim):
 
 
 class Bridge:
-    """The bridge's loop. Of `settings` it uses watchdog and arming, of the plant on the bus the node number in `bus`.
-
-    Raises:
-        CanError: The bus cannot be opened, or a frame does not fit it.
-    """
+    """The bridge's loop. Raises CanError: the bus cannot be opened, or a frame does not fit it."""
 
     def __init__(
         self, role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, bus: CanSettings
@@ -155,18 +146,17 @@ class Bridge:
         return self._bus.pending or (link is not None and link.pending)
 
     def _pass_frames(self) -> None:
-        network, link = self._network, self._network.link
-        arrival = self._bus.take()
-        if arrival is not None and link is not None and self._relay.measurement(arrival.frame) is not None:
+        measured, link = self._bus.take(), self._network.link
+        if link is None:
+            return
+        if measured is not None and self._relay.measurement(measured.frame) is not None:
             sent_ns = time.monotonic_ns()
-            link.send(arrival.frame)
-            network.sent += arrival.frame != UNCHANGED
-            self._account(arrival.frame, sent_ns)
-        arrival = link.take() if link is not None else None
-        if arrival is not None:
+            link.send(measured.frame)
+            self._network.sent += measured.frame != UNCHANGED
+            self._account(measured.frame, sent_ns)
+        if (arrival := link.take()) is not None:
             self._arrival = arrival
-            frame = self._relay.command(arrival.frame, time.monotonic_ns())
-            if frame is not None:
+            if (frame := self._relay.command(arrival.frame, time.monotonic_ns())) is not None:
                 self._bus.send(frame)
 
     def _account(self, measurement: bytes | None, sent_ns: int) -> None:
@@ -181,9 +171,11 @@ class Bridge:
             self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
             if bus.reopen():
                 self._role.event("changed", "the bus is open again")
-        elif relay.session is not None and peer is not None and bus.silent:
+        elif relay.session is None or peer is None:
+            return
+        elif bus.silent:
             relay.expire(TripCause.NODE, f"{node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
-        elif relay.session is not None and peer is not None and peer.at_ns >= self._granted_ns:
+        elif peer.at_ns >= self._granted_ns:
             if peer.fingerprint != self._fingerprint:
                 relay.expire(TripCause.NODE, f"{node} has another wire spec now")
             elif peer.state is PlantState.IDLE:
@@ -209,5 +201,5 @@ class Bridge:
             # The node sends its state ten times a second and at every change. Until it has received the first
             # heartbeat of this session, it may still send its state of before.
             self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
-        state = PlantState.GRANTED if relay.session is not None else PlantState.IDLE
+        state = PlantState.GRANTED if relay.session else PlantState.IDLE
         self._bus.beat_when_due(Heartbeat(state, relay.number, self._fingerprint))

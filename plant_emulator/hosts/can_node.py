@@ -1,8 +1,8 @@
 """Plant as a node on a CAN bus: does what the firmware of a real node does, watchdog included.
 
-There is no Zenoh and no claim on the bus. While the controller side's heartbeat says granted, with the node's own
-fingerprint, the node is in the session with that heartbeat's number: it counts its measurements from 0, applies
-commands, and trips on its own watchdog and limits. The node's own heartbeat carries its state.
+While the controller side's heartbeat says granted, with the node's own fingerprint, the node is in the session with
+that heartbeat's number: it counts its measurements from 0, applies commands, and trips on its own watchdog and limits.
+The node's own heartbeat carries its state.
 """
 
 from __future__ import annotations
@@ -24,11 +24,7 @@ MASTER: Final = "the controller's side"
 
 
 class CanNetwork(PlantNetwork):
-    """A plant end on a CAN bus; `settings` have the bus and this node's number.
-
-    Raises:
-        CanError: The bus cannot be opened, or a frame does not fit it.
-    """
+    """A plant end on a CAN bus. Raises CanError: the bus cannot be opened, or a frame does not fit it."""
 
     def __init__(self, settings: CanSettings, loop: LoopSettings, endpoint: Endpoint) -> None:
         super().__init__()
@@ -70,7 +66,6 @@ class CanNetwork(PlantNetwork):
         self.follow_session()
 
     def follow_session(self) -> None:
-        """Log events, and send a heartbeat that is due."""
         endpoint = self._endpoint
         for notice in endpoint.notices:
             self._log(*notice)
@@ -85,7 +80,6 @@ class CanNetwork(PlantNetwork):
         self._bus.beat_when_due(Heartbeat(endpoint.state, cause, self._fingerprint))
 
     def leave(self) -> None:
-        """Release a session, send an idle heartbeat, and close the bus."""
         if self._endpoint.session is not None:
             self._endpoint.release(self._endpoint.session)
         self.follow_session()

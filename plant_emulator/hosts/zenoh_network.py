@@ -37,16 +37,13 @@ from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
-OTHERS_PERIOD_NS: Final = 10_000_000
-"""How often the statuses of another plant of this name are read, of those the newest."""
+OTHERS_PERIOD_NS: Final = 10_000_000  # between two reads of the newest status of another plant of this name
 
 
 def run_plant(role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
     """Run Quanser's board or the plant that `plant.kind` names until the role stops; then 0 V and a last status.
 
-    Raises:
-        QuanserError, PluginError, PlantError: There is no such plant, it cannot be made, or it failed.
-        ValueError: A fault of a motor that the plant does not have, or another number of motors than the wire's.
+    Raises QuanserError, PluginError or PlantError; ValueError if it does not fit the wire or the configured faults.
     """
     if settings.via == "quanser":
         plant: Plant = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)
@@ -76,8 +73,8 @@ class ZenohNetwork(PlantNetwork):
         self._plant_end = endpoint if isinstance(endpoint, Endpoint) else None  # None: it is behind a bridge
         self._computed = settings.via == "emulator"
         self.steps = 0 if settings.steps_on_request else None
-        rate_hz = settings.truth_rate_hz
-        self._truth_every = max(1, round(loop.rate_hz / rate_hz)) if rate_hz else 0
+        truth_hz = settings.truth_rate_hz
+        self._truth_every = max(1, round(loop.rate_hz / truth_hz)) if truth_hz else 0
         self._link: ZenohLink | None = None
         self._trace = PlantTrace(endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
@@ -101,7 +98,6 @@ class ZenohNetwork(PlantNetwork):
     # ── the loop's calls, in their order ──
 
     def serve(self) -> None:
-        """Declare the topics, and answer claims and operator commands from now on."""
         role = self._role
         role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
@@ -111,7 +107,7 @@ class ZenohNetwork(PlantNetwork):
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
         role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
         if self._computed:
-            role.serve("inject", Inject, self._inject)
+            role.serve("inject", Inject, lambda request: lambda: self._inject(request))
             role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
         if not self._loop.lockstep:
             role.datagrams.listen()
@@ -136,9 +132,8 @@ class ZenohNetwork(PlantNetwork):
         endpoint = self._endpoint
         self._trace.row(endpoint, measurement, arrival, sent_ns)
         if endpoint.outcome is Outcome.ACTED:
-            answered = endpoint.answered
-            tick, at_ns = self._sent_at[answered % self._counters]
-            if tick == answered >= 0:
+            tick, at_ns = self._sent_at[endpoint.answered % self._counters]
+            if tick == endpoint.answered >= 0:
                 self._latency.add((sent_ns if arrival is None else arrival.at_ns) - at_ns)
         elif endpoint.outcome is Outcome.STALE:
             text = "commands answer measurements older than the watchdog's time: refused"
@@ -152,7 +147,6 @@ class ZenohNetwork(PlantNetwork):
             self._role.publish("truth", truth)
 
     def follow_session(self) -> None:
-        """Publish events and a due status, keep a new latch, and close the link of a session that ended."""
         endpoint = self._endpoint
         self._trace.follow(endpoint)
         if endpoint.session is None and self._link is not None:
@@ -170,7 +164,6 @@ class ZenohNetwork(PlantNetwork):
             self.publish_status()
 
     def publish_status(self) -> None:
-        """Publish the status: once a second, and after every event and change of state."""
         endpoint, role, end = self._endpoint, self._role, self._plant_end
         now = time.monotonic()
         _, tick, then = self._published
@@ -253,13 +246,10 @@ class ZenohNetwork(PlantNetwork):
 
         return keep
 
-    def _inject(self, request: Inject) -> Callable[[], Answer]:
-        def inject() -> Answer:
-            assert self._plant_end is not None
-            done = self._plant_end.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
-            return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
-
-        return inject
+    def _inject(self, request: Inject) -> Answer:
+        assert self._plant_end is not None
+        done = self._plant_end.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
+        return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
     def _advance(self, seconds: float) -> Answer:
         if self.steps is None:
@@ -317,12 +307,11 @@ class ZenohNetwork(PlantNetwork):
 
     def _keep_latch(self) -> None:
         """Have the latch of a tripped plant on disk, and none of one that is not."""
-        trip, cause, operator_only = self._endpoint.trip, self._endpoint.cause, self._endpoint.operator_only
-        if cause is None:
+        end, latch = self._endpoint, None
+        if end.cause is None:
             self._since = None
-        elif any(notice.kind == "tripped" for notice in self._endpoint.notices):
+        elif any(notice.kind == "tripped" for notice in end.notices):
             self._since = datetime.now(UTC)
-        latch = None
-        if trip is not None and cause is not None and self._since is not None:
-            latch = Latch(cause=trip, text=cause, operator_only=operator_only, since=self._since)
+        if end.trip is not None and end.cause is not None and self._since is not None:
+            latch = Latch(cause=end.trip, text=end.cause, operator_only=end.operator_only, since=self._since)
         self._latch_file.keep(latch)
