@@ -19,10 +19,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from aeroloop.plant_emulator.model.emulated import NO_MEASUREMENT, FilteredDerivative, attitude_of, rate_of
+from aeroloop.plant_emulator.model.emulated import NO_MEASUREMENT, Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.plant_emulator.settings import QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wire.attitude import IDENTITY
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
 """Analog outputs that carry the voltages u2 and u3, and digital outputs that enable their amplifiers."""
@@ -71,8 +72,9 @@ class QuanserPlant(Plant):
         self.failures = 0
 
         counts = COUNTS[settings.card_type]
+        sensing = SensorSettings(counts=counts, rate=settings.rate, bandwidth=settings.bandwidth)
+        self._sensors = Sensors(sensing, period, zeros=[0.5, 0.5])
         self._steps = [sign * 2 * pi / turn for sign, turn in zip(settings.encoder_signs, counts, strict=True)]
-        self._filters: list[FilteredDerivative] | None = None  # made anew after an invalid sample
         self._counts = np.zeros(2, dtype=np.int32)
         self._gyro = np.zeros(3) if settings.rate == "gyro" else None
         self._held: tuple[float, ...] = OFF
@@ -116,7 +118,8 @@ class QuanserPlant(Plant):
         if passed and alive:
             self._measurement = self._seen(passed)
         else:
-            self._measurement, self._filters = NO_MEASUREMENT, None
+            self._measurement = NO_MEASUREMENT
+            self._sensors.restart()
         if not passed:
             ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
             time.sleep(max(0.0, ahead * 1e-9))  # to the end of the period, so that the loop does not spin
@@ -201,18 +204,14 @@ class QuanserPlant(Plant):
 
     def _seen(self, passed: int) -> Measurement:
         """Measurement of the sample in the buffers, this many periods after the last one."""
-        settings = self._settings
-        pitch, yaw = (step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True))
-        attitude = attitude_of(pitch, yaw)
+        angles = [step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True)]
+        x = y = z = 0.0
         if self._gyro is not None:
-            x, y, z = (self._gyro.item(abs(axis) - 1) * (1 if axis > 0 else -1) for axis in settings.gyro_channels)
-            return Measurement(attitude, (x, y, z))
-        if self._filters is None:
-            self._filters = [FilteredDerivative(settings.bandwidth, self._period) for _ in self._steps]
-        of_pitch, of_yaw = self._filters
+            axes = self._settings.gyro_channels
+            x, y, z = (self._gyro.item(abs(axis) - 1) * (1 if axis > 0 else -1) for axis in axes)
         for _ in range(passed):
-            pitch_rate, yaw_rate = of_pitch.update(pitch), of_yaw.update(yaw)
-        return Measurement(attitude, rate_of(pitch, pitch_rate, yaw_rate))
+            measurement = self._sensors.read(IDENTITY, (x, y, z), angles)
+        return measurement
 
     # ── outputs and watchdog ──
 

@@ -6,10 +6,9 @@ Runge–Kutta steps integrate one period, and the sensors sample the new state.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from math import cos, exp, hypot, isfinite, nan, pi, sin, sqrt
-from typing import Any, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -190,14 +189,6 @@ class FilteredDerivative:
         self._from_rate = envelope * s
         self._rate_from_lag = -envelope * bandwidth**2 * s
         self._rate_from_rate = envelope * (c - decay * s)
-        self._angle: float | None = None
-        self._rate = 0.0
-
-    def update(self, angle: float) -> float:
-        """Filter a sample [rad] and return the rate [rad/s]. The filter starts at the first sample, at rest."""
-        held = angle if self._angle is None else self._angle
-        self._angle, self._rate = self.after(held, self._rate, angle)
-        return self._rate
 
     def after(self, held: Scalar, rate: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
         """Filtered angle [rad] and rate [rad/s] after a sample [rad], from those before it."""
@@ -212,24 +203,28 @@ class Sensors:
     """Sensors of one plant, sampled once a `period` [s].
 
     Attributes:
-        zeros: Of pitch and yaw encoders, within a step [1].
+        zeros: Of pitch and yaw encoders, within a step [1]; random unless given.
         given: Memory of attitude, rate and joint angles, by name: what `sample` samples.
     """
 
-    def __init__(self, settings: SensorSettings, period: float) -> None:
+    def __init__(self, settings: SensorSettings, period: float, zeros: list[float] | None = None) -> None:
         self._settings = settings
         self._gyro = settings.rate == "gyro"
         self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
         self._random = np.random.default_rng(settings.seed)
-        self.zeros: list[float] = self._random.random(len(settings.counts)).tolist()
+        self.zeros: list[float] = zeros or self._random.random(len(settings.counts)).tolist()
         self._errors = self._draw()
         self._compiled = Compiled(sensor_function(settings, period))
         given = self._compiled.inputs
         self.given = {name: given[name] for name in ("attitude", "rate", "angles")}
         self._angles, self._held, self._error = given["angles"], given["held"], given["error"]
-        for i in (0, 1):
-            given["zeros"][i] = self.zeros[i]
-            self._held[2 * i] = nan
+        given["zeros"][0], given["zeros"][1] = self.zeros
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the derivatives' filters anew, at rest at the next sample."""
+        self._held[0] = self._held[2] = nan
+        self._held[1] = self._held[3] = 0.0
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
@@ -282,7 +277,8 @@ def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
         steps = [2 * pi / counts for counts in settings.counts]
         pitch, yaw = (step * ca.floor(angles[i] / step + zeros[i]) for i, step in enumerate(steps))
         if settings.attitude == "encoders":
-            attitude = ca.vertcat(*attitude_of(pitch, yaw, ca))
+            cp, sp, cy, sy = ca.cos(pitch / 2), ca.sin(pitch / 2), ca.cos(yaw / 2), ca.sin(yaw / 2)
+            attitude = ca.vertcat(cy * cp, -sy * sp, cy * sp, sy * cp)  # yaws, then pitches
         if settings.rate == "derivative":
             derivative = FilteredDerivative(settings.bandwidth, period)
             last = [
@@ -290,22 +286,16 @@ def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
             ]
             of_pitch = derivative.after(last[0], held[1], pitch)
             of_yaw = derivative.after(last[1], held[3], yaw)
-            rate, after = ca.vertcat(*rate_of(pitch, of_pitch[1], of_yaw[1], ca)), ca.vertcat(*of_pitch, *of_yaw)
+            rate, after = ca.vertcat(*rate_of(pitch, of_pitch[1], of_yaw[1])), ca.vertcat(*of_pitch, *of_yaw)
         elif settings.rate == "gyro":
             rate = rate + error
         seen = ca.vertcat(attitude, rate)
         return ca.Function("sensors", [*given.values()], [seen, after], [*given], ["seen", "after"])
 
 
-def attitude_of(pitch: Scalar, yaw: Scalar, use: Any = math) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """q of a body that first yaws, then pitches by these joint angles [rad]; `use` is casadi for expressions."""
-    cp, sp, cy, sy = use.cos(pitch / 2), use.sin(pitch / 2), use.cos(yaw / 2), use.sin(yaw / 2)
-    return cy * cp, -sy * sp, cy * sp, sy * cp
-
-
-def rate_of(pitch: Scalar, pitch_rate: Scalar, yaw_rate: Scalar, use: Any = math) -> tuple[Scalar, Scalar, Scalar]:
-    """ω in the body frame [rad/s] of joints that turn at these rates [rad/s], at this pitch [rad]; `use` as above."""
-    return -use.sin(pitch) * yaw_rate, pitch_rate, use.cos(pitch) * yaw_rate
+def rate_of(pitch: Scalar, pitch_rate: Scalar, yaw_rate: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """ω in the body frame [rad/s] of joints that turn at these rates [rad/s], at this pitch [rad]."""
+    return -ca.sin(pitch) * yaw_rate, pitch_rate, ca.cos(pitch) * yaw_rate
 
 
 # ── one period ──
@@ -315,10 +305,7 @@ SUBSTEPS: Final = 2
 
 
 def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, period: float, substeps: int) -> ca.SX:
-    """The state one `period` [s] later, by the classical fourth-order Runge–Kutta method in equal substeps.
-
-    `derivative` is ẋ of a state, inputs held.
-    """
+    """The state one `period` [s] later, by the classical fourth-order Runge–Kutta method; `derivative` is ẋ."""
     h = period / substeps
     for _ in range(substeps):
         k1 = derivative(x)
@@ -351,14 +338,9 @@ def step_function(
     stepped = rk4(derivative, x, period, substeps)
     after = ca.vertcat(mechanism.settle(stepped[0:n]), stepped[n:])
     attitude, rate, _, angles = mechanism.outputs(after[0:n])
-    return ca.Function(
-        "step",
-        [x, u, wind],
-        [after, attitude, rate, angles],
-        ["x", "u", "wind"],
-        ["after", "attitude", "rate", "angles"],
-        {"cse": True},
-    )
+    outputs = {"after": after, "attitude": attitude, "rate": rate, "angles": angles}
+    names = ["x", "u", "wind"], list(outputs)
+    return ca.Function("step", [x, u, wind], list(outputs.values()), *names, {"cse": True})
 
 
 def initially(mechanism: Mechanism) -> tuple[Quaternion, Vector, list[float]]:
@@ -368,10 +350,7 @@ def initially(mechanism: Mechanism) -> tuple[Quaternion, Vector, list[float]]:
 
 
 class EmulatedPlant(Plant):
-    """A computed plant with an accessible true state.
-
-    `period` is the time of one `advance` [s], in `substeps` Runge–Kutta steps; `voltage_limit` is the supply's [V].
-    """
+    """A computed plant with an accessible true state; `voltage_limit` is the supply's [V]."""
 
     def __init__(
         self,
@@ -383,13 +362,12 @@ class EmulatedPlant(Plant):
         *,
         period: float,
         voltage_limit: float,
-        substeps: int = SUBSTEPS,
     ) -> None:
         self.actuators = mechanism.actuators
         self._wind, self._sensors, self._limit = wind, sensors, voltage_limit
         attitude, rate, angles = initially(mechanism)
         true = sensors.given if angles else {name: sensors.given[name] for name in ("attitude", "rate")}
-        self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps), true)
+        self._step = Compiled(step_function(mechanism, rotor, friction, period), true)
         self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value

@@ -37,7 +37,10 @@ def test_the_derivative_of_held_samples_is_the_sum_of_their_steps(period: float)
     rng = np.random.default_rng(2)
     angles = np.cumsum(rng.normal(size=60))
     f = FilteredDerivative(OMEGA_N, period)
-    rates = [f.update(float(angle)) for angle in angles]
+    held, rate, rates = float(angles[0]), 0.0, []
+    for angle in angles:
+        held, rate = f.after(held, rate, float(angle))
+        rates.append(rate)
     for k in range(60):
         expected = sum((angles[j] - angles[j - 1]) * _step_response((k - j + 1) * period) for j in range(1, k + 1))
         assert rates[k] == pytest.approx(expected, abs=1e-11)  # rounding of 60 steps of some 20 rad/s
