@@ -37,9 +37,7 @@ class QuanserSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name"
     )
     card_identifier: str = Field(default="0", min_length=1, description="which board")
-    rate: Literal["derivative", "gyro"] = Field(
-        default="derivative", description="derivative: of the encoders' angles, filtered"
-    )
+    rate: Literal["derivative", "gyro"] = Field(default="derivative", description="derivative: of the encoders' angles")
     bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
     encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
     motor_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of u2 and u3")
@@ -47,9 +45,7 @@ class QuanserSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         default=(1, 2, 3),
         description="which of the gyro's channels 1, 2, 3 measures the body's x, y, z; negative where it is reversed",
     )
-    voltage_limit: float = Field(
-        default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 recommended, 24 maximum"
-    )
+    voltage_limit: float = Field(default=18.0, gt=0, le=24, description="of a motor [V]; 18 recommended, 24 maximum")
 
     @field_validator("gyro_channels")
     @classmethod
@@ -73,9 +69,7 @@ class PlantSettings(BaseModel, extra="forbid"):
         "act; mujoco or fmu; an entry point of aeroloop.plants; or package.module:Class of your own. Faults, limits, "
         "watchdog and voltage_limit act on any",
     )
-    own: dict[str, Any] = Field(
-        default={}, description="settings of a plant that is neither aero nor rigid_body: those of its class"
-    )
+    own: dict[str, Any] = Field(default={}, description="settings of a plant's class; aero and rigid_body have none")
     armed_at_start: bool = Field(
         default=True,
         description="grant the first claim without `op arm`, unless a process before this one left a trip or a stop",
@@ -85,9 +79,7 @@ class PlantSettings(BaseModel, extra="forbid"):
         description="folder of the file that keeps a trip or a stop until `op arm`, whatever restarts; null: systemd's "
         "$STATE_DIRECTORY, else $XDG_STATE_HOME/aeroloop, else ~/.local/state/aeroloop",
     )
-    watchdog_s: float = Field(
-        default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
-    )
+    watchdog_s: float = Field(default=WATCHDOG_S, gt=0, le=10, description="0 V after so long without a command [s]")
     truth_rate_hz: float = Field(default=10.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     faults: list[str] = Field(
@@ -96,20 +88,13 @@ class PlantSettings(BaseModel, extra="forbid"):
         description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted",
     )
     fault_seed: int = Field(default=0, ge=0, description="of the faults' random numbers")
-    steps_on_request: bool = Field(
-        default=False, description="lockstep only: step only when an `advance` query requests it, for tests"
-    )
+    steps_on_request: bool = Field(default=False, description="lockstep for tests: step on an `advance` query only")
     limits: LimitSettings = Field(default=LimitSettings(), description="beyond any of these the plant trips")
     aero: AeroSettings = Field(default=AeroSettings(), description="body of the Aero, for kind = 'aero'")
     rigid_body: RigidBodySettings = Field(default=RigidBodySettings(), description="free body, for kind = 'rigid_body'")
     quanser: QuanserSettings = Field(default=QuanserSettings(), description="Quanser's board, for via = 'quanser'")
-    rotor: RotorSettings = Field(
-        default=RotorSettings(), description="lag and dead zone; lags of 0 leave the rotors out"
-    )
-    friction: FrictionSettings = Field(
-        default=FrictionSettings(),
-        description="about pitch and yaw of the Aero, or x, y, z of a free body",
-    )
+    rotor: RotorSettings = Field(default=RotorSettings(), description="lag and dead zone")
+    friction: FrictionSettings = Field(default=FrictionSettings(), description="about the joints, or x, y, z")
     wind: WindSettings = Field(default=WindSettings(), description="wind on the plant")
     sensors: SensorSettings = Field(default=SensorSettings(), description="sensors of attitude and angular velocity")
 

@@ -511,16 +511,10 @@ class Endpoint(VehicleClaim):
 class LimitSettings(BaseModel, extra="forbid"):
     """Limits; beyond any of them the plant trips."""
 
-    max_tilt_deg: float = Field(
-        default=75.0, gt=0, le=180, description="largest angle between the body's z axis and the vertical [deg]"
-    )
+    max_tilt_deg: float = Field(default=75.0, gt=0, le=180, description="largest tilt of the body's z axis [deg]")
     max_rate: float = Field(default=20.0, gt=0, description="largest angular velocity [rad/s]")
-    max_saturated_s: float = Field(
-        default=3.0, gt=0, le=600, description="longest time a motor may stay at its voltage limit [s]"
-    )
-    max_invalid_s: float = Field(
-        default=0.1, gt=0, le=60, description="longest time the sensors may have no valid value [s]"
-    )
+    max_saturated_s: float = Field(default=3.0, gt=0, le=600, description="longest time at full voltage [s]")
+    max_invalid_s: float = Field(default=0.1, gt=0, le=60, description="longest time without valid sensor values [s]")
 
 
 class LimitMonitor:

@@ -32,9 +32,7 @@ class MujocoSettings(BaseModel, extra="forbid"):
         default="aero", description="MJCF: aero or quadrotor of ours, the path of a file, or the text itself, from < on"
     )
     body: str = Field(default="body", description="the body whose attitude and angular velocity are measured")
-    keyframe: str | None = Field(
-        default=None, description="the model's keyframe to start from; its controls are those at 0 V, else 0"
-    )
+    keyframe: str | None = Field(default=None, description="to start from; its controls are those at 0 V, else 0")
     allocation: list[list[float]] | None = Field(
         default=None,
         description="controls per volt, a row for each actuator of the model, a column for each voltage [control's "
@@ -46,9 +44,7 @@ class MujocoSettings(BaseModel, extra="forbid"):
     sensors: SensorSettings = Field(
         default=SensorSettings(attitude="perfect", rate="perfect"), description="sensors of attitude and rate"
     )
-    joints: tuple[str, str] = Field(
-        default=("pitch", "yaw"), description="hinge joints that carry the encoders, if there are any"
-    )
+    joints: tuple[str, str] = Field(default=("pitch", "yaw"), description="hinges that carry the encoders, if any")
 
 
 class MujocoPlant(Plant):

@@ -31,12 +31,8 @@ _BLOCK: Final = 4096
 class RotorSettings(BaseModel, extra="forbid"):
     """Lag and dead zone of the rotors. Lags of 0 leave the rotors out."""
 
-    lag_up_s: float = Field(
-        default=0.154, ge=0, le=10, description="time constant while |thrust| rises [s]; measured on an Aero"
-    )
-    lag_down_s: float = Field(
-        default=0.176, ge=0, le=10, description="time constant while |thrust| falls [s]; measured on an Aero"
-    )
+    lag_up_s: float = Field(default=0.154, ge=0, le=10, description="time constant while |thrust| rises [s]; measured")
+    lag_down_s: float = Field(default=0.176, ge=0, le=10, description="time constant while it falls [s]; measured")
     dead_zone_v: float = Field(
         default=0.0,
         ge=0,
@@ -76,9 +72,7 @@ def thrust_voltage(settings: RotorSettings, state: ca.SX) -> ca.SX:
 class FrictionSettings(BaseModel, extra="forbid"):
     """Friction about the axes: pitch and yaw of the Aero, x, y, z of a free body (missing ones are 0)."""
 
-    viscous: tuple[float, ...] = Field(
-        default=(0.0071, 0.0220), max_length=3, description="viscous friction about the axes [N·m·s/rad]; lab material"
-    )
+    viscous: tuple[float, ...] = Field(default=(0.0071, 0.0220), max_length=3, description="[N·m·s/rad]; lab material")
     coulomb: tuple[float, ...] = Field(
         default=(0.0009, 0.003040),
         max_length=3,
@@ -163,9 +157,7 @@ class SensorSettings(BaseModel, extra="forbid"):
     """Sensors of attitude and angular velocity."""
 
     attitude: Literal["encoders", "perfect"] = Field(default="encoders", description="encoders need joints: the Aero")
-    counts: tuple[int, int] = Field(
-        default=(2048, 4096), description="encoder counts a turn, pitch and yaw; Aero 2 has 2880 in pitch"
-    )
+    counts: tuple[int, int] = Field(default=(2048, 4096), description="a turn, pitch and yaw; Aero 2 has 2880 in pitch")
     rate: Literal["derivative", "gyro", "perfect"] = Field(
         default="derivative", description="derivative: of the encoders' angles, filtered"
     )
