@@ -1,12 +1,9 @@
-"""Settings of the plant end, Quanser's board included, and the plant, faults and limits built from them.
-
-This is the only module that selects the parts of a plant.
-"""
+"""Settings of the plant end, and the plant and endpoint made of them: the only module that selects their parts."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -110,8 +107,8 @@ class PlantSettings(BaseModel, extra="forbid"):
 
     @model_validator(mode="after")
     def _parts_belong_to_the_kind(self) -> PlantSettings:
-        names = ("own",) if self.emulated else _OF_EMULATED
-        for name in names:
+        of_emulated = ("aero", "rigid_body", "rotor", "friction", "wind", "sensors")
+        for name in ("own",) if self.emulated else of_emulated:
             if getattr(self, name) != type(self).model_fields[name].default:
                 where = "a plant of another kind" if self.emulated else f"the kinds {' and '.join(EMULATED)}"
                 raise ValueError(f"plant.{name} is for {where}, and plant.kind is {self.kind!r}: leave it out")
@@ -119,8 +116,7 @@ class PlantSettings(BaseModel, extra="forbid"):
 
     @model_validator(mode="after")
     def _sensors_fit_the_body(self) -> PlantSettings:
-        needs_joints = self.sensors.attitude == "encoders" or self.sensors.rate == "derivative"
-        if self.kind == "rigid_body" and needs_joints:
+        if self.kind == "rigid_body" and self.sensors.of_joints:
             raise ValueError(
                 "a free body has no joints for encoders: set sensors.attitude to 'perfect' and sensors.rate to 'gyro' "
                 "or 'perfect'"
@@ -140,40 +136,25 @@ class PlantSettings(BaseModel, extra="forbid"):
     def mechanism(self) -> Mechanism:
         """The emulated body. Raises PlantError for any other plant."""
         if not self.emulated:
-            raise PlantError(
-                f"this needs a plant whose equations are known, plant.kind = {' or '.join(map(repr, EMULATED))}, "
-                f"and it is {self.kind!r}"
-            )
+            known = " or ".join(map(repr, EMULATED))
+            raise PlantError(f"this needs a plant whose equations are known, plant.kind = {known}, not {self.kind!r}")
         return rigid_body(self.rigid_body) if self.kind == "rigid_body" else aero(self.aero)
 
     def make(self, period: float) -> Plant:
-        """Make the plant of this kind; `advance` lets one `period` pass [s].
-
-        Raises:
-            PluginError: There is no class of the name in `kind`.
-            PlantError: It cannot be made of `own`.
-        """
+        """Make the plant of this kind; `advance` lets one `period` pass [s]. Raises PluginError, PlantError."""
         return self.build(period) if self.emulated else own_plant(self.kind, self.own, period, self.voltage_limit)
 
     def build(self, period: float) -> EmulatedPlant:
-        """Build the emulated plant; `advance` integrates one `period` [s]. Raises PlantError for any other kind."""
-        mechanism = self.mechanism()
-        return EmulatedPlant(
-            mechanism,
-            self.rotor,
-            self.friction,
-            Wind(self.wind, mechanism.axes, period),
-            Sensors(self.sensors, period),
-            period=period,
-            voltage_limit=self.voltage_limit,
-        )
+        """As `make`, of an emulated body; raises PlantError for any other kind."""
+        mechanism, limit = self.mechanism(), self.voltage_limit
+        wind, sensors = Wind(self.wind, mechanism.axes, period), Sensors(self.sensors, period)
+        return EmulatedPlant(mechanism, self.rotor, self.friction, wind, sensors, period, limit)
 
     def endpoint(self, plant: Plant, loop: LoopSettings, wire: WireSpec) -> Endpoint:
         """Make the endpoint of a plant, with the configured faults, limits and watchdog.
 
-        Raises:
-            ValueError: The wire commands another number of actuators than the plant has, or a fault is of a motor that
-                it does not have. The plant is closed then: it may be a machine.
+        Raises ValueError if a fault is of a motor that the plant does not have, or the wire commands another number of
+        motors. The plant is closed then: it may be a machine.
         """
         faults = Faults(plant.actuators, loop.period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
         full = min(self.voltage_limit, wire.voltage.quantizer().outermost)
@@ -192,7 +173,3 @@ class PlantSettings(BaseModel, extra="forbid"):
         except ValueError:
             plant.close()
             raise
-
-
-_OF_EMULATED: Final = ("aero", "rigid_body", "rotor", "friction", "wind", "sensors")
-"""Settings that act on an emulated body only."""

@@ -22,7 +22,6 @@ from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 SHIPPED: Final = {path.stem: path for path in sorted((Path(__file__).parent / "models").glob("*.xml"))}
-"""Our models, by name."""
 
 
 class MujocoSettings(BaseModel, extra="forbid"):
@@ -48,11 +47,7 @@ class MujocoSettings(BaseModel, extra="forbid"):
 
 
 class MujocoPlant(Plant):
-    """A body in MuJoCo, stepped `period` by `period` [s].
-
-    Raises:
-        PluginError: MuJoCo is not installed, the MJCF is none, or lacks what the settings name.
-    """
+    """A body in MuJoCo. Raises PluginError: no MuJoCo is installed, the MJCF is none, or lacks what is named."""
 
     Settings = MujocoSettings
     repeatable = True
@@ -78,8 +73,8 @@ class MujocoPlant(Plant):
         self._rotor = settings.rotor
         self._commanded = self._at_rotors = [0.0] * self.actuators
         self._sensors = Sensors(settings.sensors, period)
-        encoders = settings.sensors.attitude == "encoders" or settings.sensors.rate == "derivative"
-        self._joints = [self._found("joint", name).qposadr[0] for name in (settings.joints if encoders else ())]
+        joints = settings.joints if settings.sensors.of_joints else ()
+        self._joints = [self._found("joint", name).qposadr[0] for name in joints]
         self._ctrl, self._qpos, self._xquat = data.ctrl, data.qpos, data.xquat[self._body]  # views
         self._velocity = np.empty(6)
         self._sense()
@@ -89,10 +84,13 @@ class MujocoPlant(Plant):
 
     def advance(self) -> None:
         step, model, data = self._mujoco.mj_step, self._model, self._data
-        half = model.opt.timestep / 2
+        half, zone = model.opt.timestep / 2, self._rotor.dead_zone_v
         for _ in range(self._substeps):
             self._lag(half)
-            self._control(self._at_rotors)  # held over the step: its value in the middle
+            voltages = [copysign(max(abs(each) - zone, 0.0), each) for each in self._at_rotors]
+            self._ctrl[:] = self._at_rest + self._allocation.dot(
+                voltages
+            )  # held over the step: its value in the middle
             step(model, data)
             self._lag(half)
         self._sense()
@@ -138,12 +136,6 @@ class MujocoPlant(Plant):
             raise PluginError(f"allocation needs {controls} rows of one length: the MJCF has so many actuators")
         return np.array(allocation)
 
-    def _control(self, voltages: list[float]) -> None:
-        """Set the controls [their units] for voltages at the rotors [V]."""
-        if zone := self._rotor.dead_zone_v:
-            voltages = [copysign(max(abs(voltage) - zone, 0.0), voltage) for voltage in voltages]
-        self._ctrl[:] = self._at_rest + self._allocation.dot(voltages)
-
     def _lag(self, time: float) -> None:
         if not self._rotor.present:
             self._at_rotors = self._commanded
@@ -152,7 +144,6 @@ class MujocoPlant(Plant):
         self._at_rotors = [lagged(self._rotor, voltage, command, time) for voltage, command in pairs]
 
     def _sense(self) -> None:
-        """Attitude and rate of the state after the last step, and what the sensors make of them."""
         m, model, data = self._mujoco, self._model, self._data
         m.mj_kinematics(model, data)
         m.mj_comPos(model, data)

@@ -96,7 +96,7 @@ def friction_torque(settings: FrictionSettings, rates: ca.SX) -> ca.SX:
 
 
 class WindSettings(BaseModel, extra="forbid"):
-    """Wind on the plant. The default is calm; the default torques are the fitted ones of the paper's fan."""
+    """Wind on the plant: calm by default; the torques are the fitted ones of the paper's fan."""
 
     blowing: bool = Field(default=False, description="whether the fan is on")
     torque: tuple[float, ...] = Field(
@@ -166,6 +166,11 @@ class SensorSettings(BaseModel, extra="forbid"):
     gyro_bias: Vector = Field(default=(0.0, 0.0, 0.0), description="constant error of the gyro, body frame [rad/s]")
     seed: int = Field(default=0, ge=0, description="of the encoders' zeros and of the gyro's noise")
 
+    @property
+    def of_joints(self) -> bool:
+        """Whether joints must carry encoders."""
+        return self.attitude == "encoders" or self.rate == "derivative"
+
 
 class FilteredDerivative:
     """The rate of a sampled angle, by the filter ωn² s / (s² + 2ζωn s + ωn²), exact for an angle held over a period.
@@ -194,15 +199,12 @@ class FilteredDerivative:
 class Sensors:
     """Sensors of one plant, sampled once a `period` [s].
 
-    Attributes:
-        zeros: Of pitch and yaw encoders, within a step [1]; random unless given.
-        given: Memory of attitude, rate and joint angles, by name: what `sample` samples.
+    `zeros` are those of pitch and yaw encoders, within a step [1], random unless given. `given` is memory of attitude,
+    rate and joint angles, by name: what `sample` samples.
     """
 
     def __init__(self, settings: SensorSettings, period: float, zeros: list[float] | None = None) -> None:
         self._settings = settings
-        self._gyro = settings.rate == "gyro"
-        self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
         self._random = np.random.default_rng(settings.seed)
         self.zeros: list[float] = zeros or self._random.random(len(settings.counts)).tolist()
         self._errors = self._draw()
@@ -223,15 +225,15 @@ class Sensors:
         q, omega = self.given["attitude"], self.given["rate"]
         q[0], q[1], q[2], q[3] = attitude
         omega[0], omega[1], omega[2] = rate
-        if self._encoders:
+        if self._settings.of_joints:
             self._angles[0], self._angles[1] = angles
         return self.sample()
 
     def sample(self) -> Measurement:
         """Sample the true values that stand in `given`. Call it once a period."""
-        if self._encoders and not isfinite(self._angles[0] + self._angles[1]):
+        if self._settings.of_joints and not isfinite(self._angles[0] + self._angles[1]):
             return NO_MEASUREMENT
-        if self._gyro:
+        if self._settings.rate == "gyro":
             self._error[0], self._error[1], self._error[2] = self.error()
         self._compiled.evaluate()
         self._held[:] = self._compiled.outputs["after"]
@@ -351,7 +353,6 @@ class EmulatedPlant(Plant):
         friction: FrictionSettings,
         wind: Wind,
         sensors: Sensors,
-        *,
         period: float,
         voltage_limit: float,
     ) -> None:
