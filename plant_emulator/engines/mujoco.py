@@ -88,9 +88,7 @@ class MujocoPlant(Plant):
         for _ in range(self._substeps):
             self._lag(half)
             voltages = [copysign(max(abs(each) - zone, 0.0), each) for each in self._at_rotors]
-            self._ctrl[:] = self._at_rest + self._allocation.dot(
-                voltages
-            )  # held over the step: its value in the middle
+            self._ctrl[:] = self._at_rest + self._allocation.dot(voltages)  # held: its value mid-step
             step(model, data)
             self._lag(half)
         self._sense()

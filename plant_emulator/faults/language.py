@@ -76,7 +76,7 @@ class FaultError(AeroloopError, ValueError):
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of failure of one signal for a span of time. Raises ValueError: what is wrong, and what is right."""
+    """One kind of failure of one signal for a span of time. Raises ValueError with what is right."""
 
     signal: str  # a key of SIGNALS
     kind: str  # a key of KINDS
@@ -96,9 +96,8 @@ class Fault:
         if not 0 <= start <= MAX_TIME_S:
             raise ValueError(f"it must begin within 0 to {MAX_TIME_S:g} s, not at {_text(start)} s")
         if end is not None and not start < end <= MAX_TIME_S:
-            raise ValueError(
-                f"it must end after it begins at {_text(start)} s and by {MAX_TIME_S:g} s, not at {_text(end)} s"
-            )
+            after = f"after it begins at {_text(start)} s and by {MAX_TIME_S:g} s"
+            raise ValueError(f"it must end {after}, not at {_text(end)} s")
 
     def _check_value(self) -> None:
         kind, value, (*_, largest, unit) = self.kind, self.value, self.target
@@ -141,7 +140,7 @@ class Fault:
 
     @property
     def target(self) -> Signal:
-        """Signal that the fault acts on."""
+        """What it acts on."""
         return SIGNALS[self.signal]
 
     @property
@@ -158,8 +157,7 @@ def _number(text: str) -> float:
 
 
 def _text(value: float) -> str:
-    """The shortest text that reads back as the same float."""
-    return repr(value).removesuffix(".0")
+    return repr(value).removesuffix(".0")  # reads back as the same float
 
 
 def _listed(words: Iterable[str]) -> str:

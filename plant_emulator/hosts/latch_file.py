@@ -17,10 +17,8 @@ from pydantic import AwareDatetime, BaseModel, ValidationError
 
 from aeroloop.protocol.messages.states import TripCause
 
-KEPT_S: Final = 0.5
-"""How long an operator's answer waits for the disk [s]; `op arm` waits 1 s for its answer."""
-RETRY_S: Final = 5.0
-"""Time between attempts where the file cannot be written [s]."""
+KEPT_S: Final = 0.5  # so long an operator's answer waits for the disk; `op arm` waits 1 s for its answer
+RETRY_S: Final = 5.0  # between attempts where the file cannot be written
 
 
 class Latch(BaseModel, frozen=True, extra="forbid"):
@@ -44,9 +42,7 @@ def state_directory() -> Path:
 class LatchFile:
     """Keeps the latch of one vehicle's plant in a directory; in `state_directory` if it is None.
 
-    Attributes:
-        path: The file.
-        found: The latch that an earlier process left, or None. A file that cannot be read counts as a stop.
+    `found` is the latch that an earlier process left, or None. A file that cannot be read counts as a stop.
     """
 
     def __init__(self, directory: Path | None, vehicle: str) -> None:
@@ -102,10 +98,8 @@ class LatchFile:
         except OSError as failure:
             error = f"{self.path} cannot be written ({failure.strerror}); plant.state_directory names another folder"
         with self._changed:
-            if error is None:
-                self._kept = latch
-            if latch == self._wanted:
-                self._error = error
+            self._kept = latch if error is None else self._kept
+            self._error = error if latch == self._wanted else self._error
             self._changed.notify_all()
 
     def _read(self) -> Latch | None:

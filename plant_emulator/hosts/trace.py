@@ -35,11 +35,9 @@ from aeroloop.protocol.wire.transmit import UNCHANGED
 def plant_row(end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> PlantRow:
     """Trace row of the last tick; arguments as of `PlantNetwork.after_tick`, `measurement` None if it tripped."""
     command, received_ns = arrival or (b"", 0)
-    received_as = Sent.NONE
-    if arrival is not None:
-        received_as = Sent.SILENT if command == UNCHANGED else Sent.FRAME
-        if command and len(command) != end.wire.command.size:
-            received_as, command = Sent.MALFORMED, b""
+    received_as = Sent.NONE if arrival is None else Sent.FRAME if command else Sent.SILENT
+    if command and len(command) != end.wire.command.size:
+        received_as, command = Sent.MALFORMED, b""
     return PlantRow(
         end.ticked,
         end.session_tick,
@@ -108,7 +106,7 @@ _FIELDS: Final = ("session_tick", "sent_as", "outcome", "trip", "answered", "mea
 
 
 class PlantDifference(BaseModel, frozen=True):
-    """The first row with computed values that differ from the logged ones."""
+    """The first row that differs."""
 
     tick: int = Field(description="of the plant, since its process started")
     session: str
@@ -159,7 +157,7 @@ class PlantReplay:
         self._stopped: str | None = "the log has no trace of the plant"
 
     def feed(self, batch: Batch) -> None:
-        """Replay the next batch of the run. A repeated one, as a restarted recorder receives, is passed over."""
+        """Replay the next batch of the run; a repeated one, as a restarted recorder receives, is passed over."""
         header = batch.header
         if self._run is None:
             self._run, self._stopped = header.run, None
@@ -188,12 +186,11 @@ class PlantReplay:
         wire = self._wire.measurement.size, self._wire.command.size, self._wire.actuators
         if (header.measurement_bytes, header.command_bytes, header.actuators) != wire:
             raise _StoppedError("the rows are not of the wire that the description describes")
-        if header.first_row > self._rows:
-            if not self._rows:
-                raise _StoppedError("the log lacks the plant's first row, so the plant's state is not known")
-            raise _StoppedError(
-                f"{header.first_row - self._rows} rows are missing after row {self._rows - 1} of the plant"
-            )
+        missing = header.first_row - self._rows
+        if missing > 0 and not self._rows:
+            raise _StoppedError("the log lacks the plant's first row, so the plant's state is not known")
+        if missing > 0:
+            raise _StoppedError(f"{missing} rows are missing after row {self._rows - 1} of the plant")
 
     def _replay(self, batch: Batch) -> None:
         header, changes = batch.header, deque(batch.tail.operations)
@@ -221,14 +218,9 @@ class PlantReplay:
         differ = [name for name in _FIELDS if logged[name].tobytes() != computed[name].tobytes()]
         self._differ += bool(differ)
         if differ and self._first is None:
-            self._first = PlantDifference(
-                tick=int(logged["tick"]),
-                session=session,
-                session_tick=int(logged["session_tick"]),
-                field=differ[0],
-                logged=_text(logged[differ[0]]),
-                computed=_text(computed[differ[0]]),
-            )
+            name, tick, session_tick = differ[0], int(logged["tick"]), int(logged["session_tick"])
+            texts = {"logged": _text(logged[name]), "computed": _text(computed[name])}
+            self._first = PlantDifference(tick=tick, session=session, session_tick=session_tick, field=name, **texts)
 
     def _change(self, change: PlantChange) -> None:
         """Advance the plant to a change's tick and apply it."""

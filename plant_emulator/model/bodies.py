@@ -7,10 +7,9 @@ body rates are ω = A ν with ν = [ṗ, ẏ]:
 
 The mechanism does no work along A, so projecting (C.2) onto A's columns (Kane's method) leaves two equations in ν̇:
 
-    Aᵀ J A ν̇ = Aᵀ (Ψ(q, ω) + Φ(ω) θ + B u − J Ȧ ν)
+    Aᵀ J A ν̇ = Aᵀ (Ψ(q, ω) + Φ(ω) θ + B u − J Ȧ ν) + a load, a torque about each joint
 
-A load, a torque about each joint, is added to the right-hand side. Roll's row of B does not matter; two motors act, u₂
-and u₃.
+Roll's row of B does not matter; two motors act, u₂ and u₃.
 
 *The free body* has three axes, three actuators and any attitude; a load is the disturbance τ_d of (C.78).
 """
@@ -107,14 +106,9 @@ def aero(settings: AeroSettings) -> Mechanism:
     q, omega = from_euler(ca.vertcat(0, pitch, yaw)), A @ nu
     torque = A.T @ (torque_of_motion(settings, settings.damping, q, omega) + B @ u - J @ A_dot @ nu) + load
     nu_dot = ca.solve(A.T @ J @ A, torque)
-    return Mechanism(
-        (0.0, 0.0, 0.0, 0.0),
-        2,
-        2,
-        ca.Function("aero", [x, u, load], [ca.vertcat(nu, nu_dot)]),
-        ca.Function("outputs", [x], [q, omega, nu, x[0:2]]),
-        ca.Function("settle", [x], [x]),
-    )
+    derivative = ca.Function("aero", [x, u, load], [ca.vertcat(nu, nu_dot)])
+    outputs = ca.Function("outputs", [x], [q, omega, nu, x[0:2]])
+    return Mechanism((0.0,) * 4, 2, 2, derivative, outputs, ca.Function("settle", [x], [x]))
 
 
 def rigid_body(settings: RigidBodySettings) -> Mechanism:
@@ -124,12 +118,9 @@ def rigid_body(settings: RigidBodySettings) -> Mechanism:
     J, B = ca.diag(ca.SX(settings.inertia)), ca.SX(np.array(settings.allocation))
     torque = torque_of_motion(settings, settings.damping, q, omega) + B @ u + load
     omega_dot = ca.solve(J, torque)  # (C.2), (C.78)
+    derivative = ca.Function("rigid_body", [x, u, load], [ca.vertcat(T(q) @ omega, omega_dot)])  # (C.1)
+    outputs = ca.Function("outputs", [x], [q, omega, omega, x[0:0]])
+    settle = ca.Function("settle", [x], [ca.vertcat(q / ca.norm_2(q), omega)])
     length = float(np.linalg.norm(settings.attitude))
-    return Mechanism(
-        (*(part / length for part in settings.attitude), *settings.rate),
-        3,
-        3,
-        ca.Function("rigid_body", [x, u, load], [ca.vertcat(T(q) @ omega, omega_dot)]),  # (C.1)
-        ca.Function("outputs", [x], [q, omega, omega, x[0:0]]),
-        ca.Function("settle", [x], [ca.vertcat(q / ca.norm_2(q), omega)]),
-    )
+    initial = (*(part / length for part in settings.attitude), *settings.rate)
+    return Mechanism(initial, 3, 3, derivative, outputs, settle)
