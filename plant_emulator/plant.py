@@ -38,7 +38,7 @@ _UNIT: Final = 0.01  # a quaternion so much longer or shorter than 1 is none: an
 
 
 class PlantError(AeroloopError):
-    """A plant of one's own failed; one line with its class, file and line."""
+    """A plant cannot be used or failed; one line, of a plant of one's own with its class, file and line."""
 
 
 class Measurement(NamedTuple):

@@ -337,7 +337,6 @@ class Endpoint(VehicleClaim):
         ValueError: The wire commands another number of actuators than the plant has.
 
     Attributes:
-        accepted: Commands applied so far.
         outgoing: After a tick, the frames to send in order: what the faults of frames leave of the measurement.
     """
 
@@ -357,7 +356,6 @@ class Endpoint(VehicleClaim):
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
         super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.plant = plant
-        self.accepted = 0
         self.outgoing: list[bytes] = []
         self._faults, self._limits = faults or Faults(plant.actuators, period_ns * 1e-9), limits
         self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
@@ -416,7 +414,6 @@ class Endpoint(VehicleClaim):
             self.ticked = 0
         elif command is not None and self.session is not None:
             self.outcome = self._command(command, self._now_ns)
-            self.accepted += self.outcome is Outcome.ACTED
         while self.ticked < k:
             if (reason := self._freshness.overdue(self._now_ns)) is not None:
                 self._trip(TripCause.COMMAND_TIMEOUT, reason)
@@ -462,14 +459,7 @@ class Endpoint(VehicleClaim):
     # ── faults and truth ──
 
     def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
-        """Add faults with start and end counted from now; if `clear`, remove all others first.
-
-        Returns:
-            What was done, a line each; they are events, too.
-
-        Raises:
-            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
-        """
+        """As `Faults.inject`. Returns what was done, a line each; they are events, too. Raises FaultError."""
         self._note_faults(self._faults.inject(faults, "injected", clear=clear))
         names = [*([None] if clear else []), *map(str, faults)]
         for name in names:

@@ -12,6 +12,7 @@ from contextlib import chdir, suppress
 from math import cos, radians, sin
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from textwrap import shorten
 from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BaseModel, Field, model_validator
@@ -24,10 +25,6 @@ Name = Annotated[str, Field(min_length=1, max_length=500)]
 
 _FATAL: Final = 4
 """FMI's status after which the FMU must not be called again."""
-
-
-class FmuError(PluginError):
-    """The FMU cannot be used, or failed; one line with its file and, where it logged any, its own words."""
 
 
 class FmuSettings(BaseModel, extra="forbid", frozen=True):
@@ -59,11 +56,7 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class FmuPlant(Plant):
-    """A co-simulation FMU as a plant, stepped `period` by `period` [s].
-
-    Raises:
-        FmuError: FMPy is not installed, or the FMU cannot be used with these settings; from `advance`: it failed.
-    """
+    """A co-simulation FMU as a plant. Raises PluginError: FMPy is missing, it cannot be used, or failed."""
 
     Settings: ClassVar[type[BaseModel]] = FmuSettings
     repeatable: ClassVar[bool] = True  # a simulation; of one that is not, a replay finds the first tick that differs
@@ -98,7 +91,7 @@ class FmuPlant(Plant):
             self._set(self._inputs, self._voltages)
             ended = self._fmu.doStep(time, self._period)
             if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
-                raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._words}")
+                raise PluginError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._words}")
             self._periods += 1
             self._sample()
         except Exception as error:
@@ -126,10 +119,9 @@ class FmuPlant(Plant):
             if each.causality in causalities and each.type == self._real and not each.shape
         }
         if name not in fitting:
-            listed = ", ".join(list(fitting)[:8]) + (f" and {len(fitting) - 8} more" if len(fitting) > 8 else "")
-            raise FmuError(
-                f"{self._name} has no {causalities[0]} {name} of type {self._real}; it has {listed or 'none'}"
-            )
+            listed = shorten(", ".join(fitting), 200, placeholder=" …")
+            wanted = f"{causalities[0]} {name} of type {self._real}"
+            raise PluginError(f"{self._name} has no {wanted}; it has {listed or 'none'}")
         variable = fitting[name]
         unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
         return variable.valueReference, radians(1) if unit.startswith("deg") else 1.0
@@ -150,7 +142,8 @@ class FmuPlant(Plant):
             fmu.enterInitializationMode()
             unset = apply_start_values(fmu, self._description, unset, settable_in_initialization_mode)
             if unset:
-                raise FmuError(f"{self._name} has no parameter or start value {', '.join(unset)}: see plant.own.start")
+                names = ", ".join(unset)
+                raise PluginError(f"{self._name} has no parameter or start value {names}: see plant.own.start")
             fmu.exitInitializationMode()
         except Exception as error:
             raise self._failure("it does not start", error) from None
@@ -172,23 +165,19 @@ class FmuPlant(Plant):
         if status and text:
             self._words = ": " + " ".join(text.decode(errors="replace").split())
 
-    def _failure(self, what: str, error: Exception) -> FmuError:
-        if isinstance(error, FmuError):
+    def _failure(self, what: str, error: Exception) -> PluginError:
+        if isinstance(error, PluginError):
             return error
         self._fatal |= getattr(error, "status", None) == _FATAL
         text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        return FmuError(f"{self._name}: {what}: {text}{self._words}")
+        return PluginError(f"{self._name}: {what}: {text}{self._words}")
 
 
 def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Attitude of these angles [rad]: yaw about z first, then pitch, then roll."""
     (cr, sr), (cp, sp), (cy, sy) = ((cos(angle / 2), sin(angle / 2)) for angle in (roll, pitch, yaw))
-    return (
-        cy * cp * cr + sy * sp * sr,
-        cy * cp * sr - sy * sp * cr,
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-    )
+    w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
+    return w, x, cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
 
 
 def _description(file: Path) -> Any:
@@ -196,15 +185,15 @@ def _description(file: Path) -> Any:
         import fmpy
     except ModuleNotFoundError as missing:
         what = "FMPy" if missing.name == "fmpy" else f"FMPy with {missing.name}"
-        raise FmuError(f"an FMU needs {what}, which is not installed: pip install 'aeroloop[fmi]'") from None
+        raise PluginError(f"an FMU needs {what}, which is not installed: pip install 'aeroloop[fmi]'") from None
     if not file.is_file():
-        raise FmuError(f"there is no file {file}: set plant.own.file")
+        raise PluginError(f"there is no file {file}: set plant.own.file")
     try:
         with file.open("rb") as opened:  # FMPy would not close it
             description = fmpy.read_model_description(opened, validate=False)
         version = description.fmiMajorVersion
     except Exception as error:
-        raise FmuError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
+        raise PluginError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
     if version not in (2, 3) or description.coSimulation is None:
-        raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for co-simulation by FMI 2 or 3")
+        raise PluginError(f"{file.name} is of FMI {description.fmiVersion}: export it for co-simulation by FMI 2 or 3")
     return description

@@ -43,13 +43,8 @@ class ActingFault:
     """A fault in the plant's time, injected at the time `now` [s].
 
     `last` is what its signal was just before: its values, or the frame that passed last; None if there were none.
-    Garbled values are within ±`bound`, in their unit.
-
-    Attributes:
-        begin, end: Ticks at which it begins and ends; infinity for no end.
-        begun, over: Whether `transitions` has returned its begin and its end; also over if between two ticks.
-        changed: Samples, voltages of a period, or frames that it has changed.
-        held: Frames held back, each with a time [s].
+    Garbled values are within ±`bound`. `changed` counts samples, voltages of a period, or frames that it has changed;
+    `held` are frames held back, each with a time [s].
     """
 
     def __init__(
@@ -58,7 +53,7 @@ class ActingFault:
         self.fault, self.source, self.kind, self.value = fault, source, fault.kind, fault.value or 0.0
         self.begin = first_tick(round(fault.start_s + now, 9), period)
         self.end = inf if fault.end_s is None else first_tick(round(fault.end_s + now, 9), period)
-        self.begun, self.over = False, self.begin == self.end
+        self.begun, self.over = False, self.begin == self.end  # `transitions` has returned them; none between two ticks
         self.changed = 0
         self.held: deque[tuple[float, bytes]] = deque()
         self._random, self._last, self._bound = random, last, bound

@@ -70,11 +70,7 @@ class Relay(VehicleClaim):
         return None if self._judged is Outcome.MALFORMED else frame
 
     def watch(self, now_ns: int) -> bool:
-        """Trip if no fresh command was received in time. In lockstep only the first command has a deadline.
-
-        Returns:
-            Whether it tripped, which is a tick without a measurement.
-        """
+        """Trip if no fresh command was received in time; in lockstep only the first has a deadline. It is a tick."""
         if self.session is None or (self.lockstep and self.state is PlantState.DRIVEN):
             return False
         if self._freshness.since_ns is None:

@@ -20,9 +20,8 @@ from typing import Any, Final
 import numpy as np
 
 from aeroloop.plant_emulator.model.emulated import NO_MEASUREMENT, Sensors, SensorSettings
-from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.plant import Measurement, Plant, PlantError
 from aeroloop.plant_emulator.settings import QuanserSettings
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.attitude import IDENTITY
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
@@ -38,10 +37,6 @@ _SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board
 _UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
 
 
-class QuanserError(AeroloopError):
-    """Quanser's board cannot be used; the message is one line with the reason."""
-
-
 class QuanserPlant(Plant):
     """The Aero on its board. Its encoders are relative: keep the Aero level and at yaw 0 while this object is made.
 
@@ -50,7 +45,7 @@ class QuanserPlant(Plant):
     expiries of the watchdog.
 
     Raises:
-        QuanserError: The interface is missing, or the board cannot be opened, prepared or, at the first call, started.
+        PlantError: The interface is missing, or the board cannot be opened, prepared or, at the first call, started.
     """
 
     actuators = 2
@@ -63,7 +58,7 @@ class QuanserPlant(Plant):
             # Not every version exports this one in the module above.
             self._overflow: Any = import_module("quanser.hardware.enumerations").BufferOverflowMode
         except (ImportError, OSError) as error:  # OSError: the libraries that the package loads are missing
-            raise QuanserError(
+            raise PlantError(
                 f"Quanser's Python interface is missing ({error}): install the Quanser SDK, then in this environment "
                 "`pip install --find-links <SDK's folder>/python quanser_api`"
             ) from error
@@ -92,7 +87,7 @@ class QuanserPlant(Plant):
         try:
             with self._required(f"cannot make {card} ready"):
                 self._prepare()
-        except QuanserError:
+        except PlantError:
             self.close()
             raise
 
@@ -185,7 +180,7 @@ class QuanserPlant(Plant):
         try:
             yield
         except self._error as error:
-            raise QuanserError(f"{what_fails}: {error.get_error_message()}{hint}") from error
+            raise PlantError(f"{what_fails}: {error.get_error_message()}{hint}") from error
 
     # ── samples ──
 

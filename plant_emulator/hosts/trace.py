@@ -18,8 +18,9 @@ from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.endpoint.endpoint import VehicleClaim
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.plant import PlantError, class_of
+from aeroloop.plant_emulator.plant import class_of
 from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, TraceWriter
@@ -138,10 +139,6 @@ def why_not(plant: PlantSettings) -> str | None:
     return None if found.repeatable else f"{found.__name__} (plant.kind) does not state that it is `repeatable`"
 
 
-class _StoppedError(Exception):
-    """The replay ends here, with the reason."""
-
-
 class PlantReplay:
     """Replays one process of an emulated plant. Raises ValueError with the reason of `why_not`, or PlantError."""
 
@@ -167,7 +164,7 @@ class PlantReplay:
         try:
             self._check(header)
             self._replay(batch)
-        except (_StoppedError, PlantError) as error:
+        except AeroloopError as error:
             self._stopped = str(error)
         if header.rows:
             self._rows = header.first_row + header.rows
@@ -180,17 +177,17 @@ class PlantReplay:
         return PlantReplayed(**result, first_difference=self._first, stopped=self._stopped)
 
     def _check(self, header: Header) -> None:
-        """Raise _StoppedError if a batch does not follow what was replayed."""
+        """Raise AeroloopError if a batch does not follow what was replayed."""
         if header.run != self._run:
-            raise _StoppedError("the plant was started again")
+            raise AeroloopError("the plant was started again")
         wire = self._wire.measurement.size, self._wire.command.size, self._wire.actuators
         if (header.measurement_bytes, header.command_bytes, header.actuators) != wire:
-            raise _StoppedError("the rows are not of the wire that the description describes")
+            raise AeroloopError("the rows are not of the wire that the description describes")
         missing = header.first_row - self._rows
         if missing > 0 and not self._rows:
-            raise _StoppedError("the log lacks the plant's first row, so the plant's state is not known")
+            raise AeroloopError("the log lacks the plant's first row, so the plant's state is not known")
         if missing > 0:
-            raise _StoppedError(f"{missing} rows are missing after row {self._rows - 1} of the plant")
+            raise AeroloopError(f"{missing} rows are missing after row {self._rows - 1} of the plant")
 
     def _replay(self, batch: Batch) -> None:
         header, changes = batch.header, deque(batch.tail.operations)
@@ -202,7 +199,7 @@ class PlantReplay:
             while changes and changes[0].tick < tick:
                 self._change(changes.popleft())
             if self._endpoint.session != header.session:
-                raise _StoppedError(f"tick {tick} is in a session whose claim is missing")
+                raise AeroloopError(f"tick {tick} is in a session whose claim is missing")
             self._compare(header.session, row)
         for change in changes:
             self._change(change)
@@ -229,14 +226,14 @@ class PlantReplay:
             return  # it failed within a tick, which has no row, and its process ended
         if change.tick > endpoint.ticked:
             if endpoint.session is not None:
-                raise _StoppedError(f"rows are missing before tick {change.tick}, where a session runs")
+                raise AeroloopError(f"rows are missing before tick {change.tick}, where a session runs")
             endpoint.tick(None, change.tick)
         name, reason, cause = change.name or "", change.reason or "", change.cause or TripCause.OPERATOR
         match change.kind:
             case "claim":
                 assert change.claim is not None
                 if isinstance(answer := endpoint.claim(change.claim), Refusal):
-                    raise _StoppedError(f"the claim after tick {change.tick} is refused: {answer.reason}")
+                    raise AeroloopError(f"the claim after tick {change.tick} is refused: {answer.reason}")
             case "release":
                 endpoint.release(name)
             case "arm":

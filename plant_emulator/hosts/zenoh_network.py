@@ -43,7 +43,7 @@ OTHERS_PERIOD_NS: Final = 10_000_000  # between two reads of the newest status o
 def run_plant(role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
     """Run Quanser's board or the plant that `plant.kind` names until the role stops; then 0 V and a last status.
 
-    Raises QuanserError, PluginError or PlantError; ValueError if it does not fit the wire or the configured faults.
+    Raises PluginError or PlantError; ValueError if it does not fit the wire or the configured faults.
     """
     if settings.via == "quanser":
         plant: Plant = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)

@@ -6,6 +6,7 @@ Runge–Kutta steps integrate one period, and the sensors sample the new state.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from math import cos, exp, hypot, isfinite, nan, pi, sin, sqrt
 from typing import Final, Literal, TypeVar
@@ -199,8 +200,7 @@ class FilteredDerivative:
 class Sensors:
     """Sensors of one plant, sampled once a `period` [s].
 
-    `zeros` are those of pitch and yaw encoders, within a step [1], random unless given. `given` is memory of attitude,
-    rate and joint angles, by name: what `sample` samples.
+    `zeros` are those of pitch and yaw encoders, within a step [1], random unless given.
     """
 
     def __init__(self, settings: SensorSettings, period: float, zeros: list[float] | None = None) -> None:
@@ -210,9 +210,8 @@ class Sensors:
         self._errors = self._draw()
         self._compiled = Compiled(sensor_function(settings, period))
         given = self._compiled.inputs
-        self.given = {name: given[name] for name in ("attitude", "rate", "angles")}
-        self._angles, self._held, self._error = given["angles"], given["held"], given["error"]
-        given["zeros"][0], given["zeros"][1] = self.zeros
+        self._held, self._error = given["held"], given["error"]
+        given["zeros"][:] = array("d", self.zeros)
         self.restart()
 
     def restart(self) -> None:
@@ -222,19 +221,14 @@ class Sensors:
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
-        q, omega = self.given["attitude"], self.given["rate"]
-        q[0], q[1], q[2], q[3] = attitude
-        omega[0], omega[1], omega[2] = rate
-        if self._settings.of_joints:
-            self._angles[0], self._angles[1] = angles
-        return self.sample()
-
-    def sample(self) -> Measurement:
-        """Sample the true values that stand in `given`. Call it once a period."""
-        if self._settings.of_joints and not isfinite(self._angles[0] + self._angles[1]):
+        if self._settings.of_joints and not isfinite(sum(angles)):
             return NO_MEASUREMENT
+        given = self._compiled.inputs
+        given["attitude"][:], given["rate"][:] = array("d", attitude), array("d", rate)
+        if self._settings.of_joints:
+            given["angles"][:] = array("d", angles)
         if self._settings.rate == "gyro":
-            self._error[0], self._error[1], self._error[2] = self.error()
+            self._error[:] = array("d", self.error())
         self._compiled.evaluate()
         self._held[:] = self._compiled.outputs["after"]
         w, x, y, z, a, b, c = self._compiled.outputs["seen"].tolist()
@@ -359,33 +353,31 @@ class EmulatedPlant(Plant):
         self.actuators = mechanism.actuators
         self._wind, self._sensors, self._limit = wind, sensors, voltage_limit
         attitude, rate, angles = initially(mechanism)
-        true = sensors.given if angles else {name: sensors.given[name] for name in ("attitude", "rate")}
-        self._step = Compiled(step_function(mechanism, rotor, friction, period), true)
+        self._step = Compiled(step_function(mechanism, rotor, friction, period))
         self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
-        for i, value in enumerate(mechanism.initial):
-            self._x[i] = value
+        self._x[: len(mechanism.initial)] = array("d", mechanism.initial)
+        self._true = attitude, rate
         self._measurement = sensors.read(attitude, rate, angles)
 
     def actuate(self, voltages: Sequence[float]) -> None:
         limit = self._limit
-        for i, voltage in enumerate(voltages):
-            self._u[i] = max(-limit, min(limit, voltage))
+        self._u[:] = array("d", [max(-limit, min(limit, voltage)) for voltage in voltages])
 
     def advance(self) -> None:
         if not self._wind.calm:
-            for i, torque in enumerate(self._wind.sample()):
-                self._load[i] = torque
+            self._load[:] = array("d", self._wind.sample())
         self._step.evaluate()
-        self._x[:] = self._step.outputs["after"]
-        self._measurement = self._sensors.sample()
+        after, attitude, rate, angles = self._step.outputs.values()
+        self._x[:] = after
+        (w, x, y, z), (a, b, c) = attitude, rate
+        self._true = (w, x, y, z), (a, b, c)
+        self._measurement = self._sensors.read(*self._true, angles)
 
     def measure(self) -> Measurement:
         return self._measurement
 
     def truth(self) -> State:
-        w, x, y, z = self._sensors.given["attitude"]
-        a, b, c = self._sensors.given["rate"]
-        return State((w, x, y, z), (a, b, c), tuple(self._u))
+        return State(*self._true, tuple(self._u))
 
     def close(self) -> None:
         self.actuate((0.0,) * len(self._u))

@@ -132,7 +132,6 @@ def test_one_motor_or_eight_are_driven_and_replayed_byte_for_byte(kind: str, act
     wire, own = WireSpec(actuators=actuators), {"inertia": 0.01}
     faults = [f"motor{actuators}:stuck@0.02..0.05", "rate.z:noise=0.05@0.03", "attitude:bias=0.1@0.02..0.06"]
     stage = stage_of(kind, wire, own, faults, lockstep=lockstep).run(TICKS)
-    assert stage.endpoint.accepted > TICKS / 2
     assert sum(fault.changed for fault in stage.endpoint.fault_statuses()) > 0
     replay = PlantReplay(stage.loop, wire, PlantSettings(kind=f"{HERE}:{kind}", own=own, faults=faults))
     for batch in stage.batches:

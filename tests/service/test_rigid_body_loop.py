@@ -121,7 +121,7 @@ def run_from(bits: str, q: Array, omega: Array, first_tick: int, seconds: float)
         state = theta, controller.voltages, controller.law_state["sign"]
         rows.append((true, controller.attitude, *desired(k), *state))
         measurement = endpoint.tick(command, k + 1 - first_tick)
-    assert endpoint.accepted == len(frames)
+    assert endpoint.answered == len(frames) - 1
     columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
     return Run(settings, frames, commands, endpoint.saturated + controller.saturated, *columns)
 

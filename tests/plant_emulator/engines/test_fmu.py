@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from aeroloop.plant_emulator.engines.fmu import FmuError, FmuPlant, FmuSettings, quaternion_of
+from aeroloop.plant_emulator.engines.fmu import FmuPlant, FmuSettings, quaternion_of
 from aeroloop.plant_emulator.model.emulated import WindSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.protocol.plugins import PluginError
 from tests.support import ideal
 from tests.support.aero_fmu import PERIOD, altered, fmi2, fmi3, fmpy
 from tests.support.numpy_twin import rotation
@@ -135,7 +136,7 @@ REFUSED: dict[str, tuple[dict[str, Any], tuple[tuple[str, str], ...], tuple[str,
 
 
 def refusal(settings: FmuSettings) -> str:
-    with pytest.raises(FmuError) as refused:
+    with pytest.raises(PluginError) as refused:
         FmuPlant(settings, PERIOD)
     assert "\n" not in str(refused.value)
     return str(refused.value)
@@ -161,7 +162,7 @@ def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(
     monkeypatch.setattr("fmpy.fmi2.FMU2Slave.freeInstance", lambda _: freed.append(None))
     for status, name in ((3, "error"), (4, "fatal")):
         plant = FmuPlant(settings_of(fmus["fmi2"], start={"fails_at": 0.1, "fails_with": status}), PERIOD)
-        with pytest.raises(FmuError) as failed:
+        with pytest.raises(PluginError) as failed:
             driven(plant, WOBBLE)
         assert str(failed.value) == (
             f"aero.fmu: it failed at 0.1 s: fmi2DoStep failed with status {status} ({name}): the motor burnt at 0.1 s"
@@ -170,7 +171,7 @@ def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(
         plant.close()
     assert len(freed) == 1  # after the fatal status, FMI forbids any call
     plant = FmuPlant(settings_of(fmus["fmi3"], "joints", start={"load_pitch": 5.0}), PERIOD)
-    with pytest.raises(FmuError, match=r"aero.fmu: it ended by itself at 0\.1\d+ s"):
+    with pytest.raises(PluginError, match=r"aero.fmu: it ended by itself at 0\.1\d+ s"):
         driven(plant, WOBBLE)
     plant.close()
 

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from aeroloop.plant_emulator.hosts import quanser_board
-from aeroloop.plant_emulator.hosts.quanser_board import QuanserError, QuanserPlant
+from aeroloop.plant_emulator.hosts.quanser_board import QuanserPlant
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant, SensorSettings
-from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.plant import Measurement, Plant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
 from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState
@@ -116,7 +116,7 @@ CLOSING = ["write_analog", "write_digital", "watchdog_stop", "task_stop", "task_
 
 
 def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_install() -> None:
-    with pytest.raises(QuanserError, match=r"No module named 'quanser'.*Quanser SDK.*quanser_api") as refused:
+    with pytest.raises(PlantError, match=r"No module named 'quanser'.*Quanser SDK.*quanser_api") as refused:
         QuanserPlant(QuanserSettings(), PERIOD, 0.1)
     assert "\n" not in str(refused.value)
 
@@ -166,19 +166,19 @@ def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None
         (QuanserSettings(card_identifier="1"), "quanser_aero2_usb '1': there is no quanser_aero2_usb '1'"),
         (QuanserSettings(), "quanser_aero2_usb '0': the board is in use"),
     ]:
-        with pytest.raises(QuanserError, match=f"cannot open {words}"):
+        with pytest.raises(PlantError, match=f"cannot open {words}"):
             plant_of(board, settings)
 
 
 def test_a_board_that_cannot_be_made_ready_is_closed_and_one_that_cannot_be_started_is_reported() -> None:
     board = FakeQuanser(AERO, PERIOD)
     board.fail_next("task_create_reader")
-    with pytest.raises(QuanserError, match="cannot make quanser_aero2_usb '0' ready: task_create_reader was made"):
+    with pytest.raises(PlantError, match="cannot make quanser_aero2_usb '0' ready: task_create_reader was made"):
         plant_of(board)
     assert board.holder is None
     plant = plant_of(board)  # so another try can have it
     board.fail_next("watchdog_start")
-    with pytest.raises(QuanserError, match="cannot start quanser_aero2_usb: watchdog_start was made to fail"):
+    with pytest.raises(PlantError, match="cannot start quanser_aero2_usb: watchdog_start was made to fail"):
         plant.advance()
     plant.close()
     assert board.holder is None
