@@ -6,10 +6,8 @@ might: a watchdog that has not expired refuses to be cleared, and clearing an ex
 the expiry. A wrong use raises MisuseError, which no code treats as a failure of the board.
 
 The board's time is a count of samples. With `realtime` samples fall due on an absolute grid, read or not; without,
-`task_read` lets the next period pass at once. No time passes before the task is started. Emulated is what the plant
-uses: two motors, encoders and gyro, one reader task with a buffer of one sample.
-
-`quanser_sdk/` beside this file is the package `quanser` with this board in it, for processes that tests start.
+`task_read` lets the next period pass at once. `quanser_sdk/` beside this file is the package `quanser` with this board
+in it, for processes that tests start.
 """
 
 from __future__ import annotations
@@ -18,13 +16,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partialmethod
+from functools import partial, partialmethod
 from math import atan2, ceil, isnan, pi
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from aeroloop.plant_emulator.hosts.quanser_board import COUNTS
+from aeroloop.plant_emulator.model.emulated import SensorSettings
 from aeroloop.plant_emulator.plant import State
 from aeroloop.plant_emulator.settings import PlantSettings
 
@@ -65,39 +64,39 @@ class BufferOverflowMode:
 
 @dataclass
 class Task:
-    """A reader task: its channels and its unread samples, one at the most."""
+    """A reader task: its channels, encoders and other, and its unread samples, one at the most."""
 
-    encoders: list[int]
-    other: list[int]
+    channels: tuple[list[int], list[int]]
     samples: deque[tuple[list[int], list[float]]] = field(default_factory=lambda: deque(maxlen=1))
     mode: int = 0
     overflows: int = 0
     running: bool = False
-    deleted: bool = False
+
+
+class Handle:
+    """What `HIL()` makes: every call is the board's, which checks it."""
+
+    def __init__(self, board: FakeQuanser) -> None:
+        self._board = board
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return partial(self._board.call, self, name)
 
 
 class FakeQuanser:
-    """A board with an emulated Aero on it, and the names of the module `quanser.hardware`.
-
-    Its joints have the card's encoders, and its IMU a gyro. `time` counts samples since the task was started.
-    """
-
-    HILError = HILError
-    Clock = Clock
-    BufferOverflowMode = BufferOverflowMode
+    """A board with an emulated Aero on it. `time` counts samples since the task was started."""
 
     def __init__(
         self, settings: PlantSettings, period: float, *, card_type: str = "quanser_aero2_usb", realtime: bool = False
     ) -> None:
-        self.HIL: Callable[[], FakeHIL] = lambda: FakeHIL(self)
+        self.HIL: Callable[[], Handle] = lambda: Handle(self)
         self.card_type, self.period, self.realtime = card_type, period, realtime
         self.calls: deque[str] = deque(maxlen=10_000)  # names of the last calls
         self._turns = COUNTS[card_type]
-        sensors = {"attitude": "encoders", "counts": self._turns, "rate": "gyro"}
-        sensing = settings.sensors.model_copy(update=sensors)
-        self._plant = settings.model_copy(update={"sensors": sensing}).build(period)
+        sensors = SensorSettings(counts=self._turns, rate="gyro")
+        self._plant = settings.model_copy(update={"sensors": sensors}).build(period)
 
-        self.holder: FakeHIL | None = None
+        self.holder: Handle | None = None
         self.task: Task | None = None
         self.time = 0
         self.analog, self.enabled = [0.0, 0.0], [0, 0]
@@ -125,7 +124,7 @@ class FakeQuanser:
 
     def fail_next(self, call: str, n: int = 1) -> None:
         """Let the next n calls of a method fail; a failed `task_read` loses its sample."""
-        assert hasattr(FakeHIL, call), call
+        assert hasattr(self, f"on_{call}"), call
         self._failing[call] = n
 
     def unplug(self) -> None:
@@ -152,7 +151,7 @@ class FakeQuanser:
         self.time += 1
         self._count()
         task.overflows += len(task.samples)
-        task.samples.append(self.sample(task.encoders, task.other))
+        task.samples.append(self.sample(*task.channels))
 
     def wait(self) -> None:
         """Let periods pass until there is a sample to read."""
@@ -167,17 +166,27 @@ class FakeQuanser:
         gyro = self._plant.measure().rate
         return counts, [gyro[channel - _GYRO.start] for channel in other]
 
-    def called(self, name: str) -> None:
-        """Record a call and fail it if a test requested that. Samples due by now are taken first."""
+    def call(self, handle: Handle, name: str, *arguments: Any) -> Any:
+        """A call through a handle. Samples due by now are taken first; a failed `task_read` loses its sample."""
+        method = getattr(self, f"on_{name}")
         self.calls.append(name)
         if self.realtime and self.task is not None and self.task.running:
             while time.monotonic_ns() >= self._due_ns():
                 self.step()
         self._check_watchdog()
+        if name == "close":  # whatever happens; nothing if it is not open
+            if self.holder is not handle:
+                return None
+            self.holder = self.task = None
+        failing = self._failing[name] > 0
+        self._failing[name] -= failing
+        if name == "task_read" and not self.realtime and (failing or self._unplugged):
+            self.wait()
+            arguments[0].samples.clear()
         _refuse(self._unplugged, "the board is not connected")
-        if self._failing[name]:
-            self._failing[name] -= 1
-            raise HILError(f"{name} was made to fail")
+        _refuse(failing, f"{name} was made to fail")
+        _require(name in ("open", "close") or self.holder is handle, f"{name} on a board that is not open")
+        return method(handle, *arguments) if name == "open" else method(*arguments)
 
     def restore(self, outputs: dict[Kind, list[Any]]) -> None:
         for kind, values in outputs.items():
@@ -206,186 +215,135 @@ class FakeQuanser:
             moved = round(angle / (2 * pi) * turn) - self._raw[channel]
             self._raw[channel] += (moved + turn // 2) % turn - turn // 2  # the joint may turn more than once
 
+    # ── the interface ──
 
-class FakeHIL:
-    """Handle of the board: checks every call and passes it to the board."""
-
-    def __init__(self, device: FakeQuanser) -> None:
-        self._device = device
-        self._set: set[Kind] = set()  # kinds of expiration states set by this handle
-
-    def open(self, card_type: str, card_identifier: str, /) -> None:
-        device = self._device
-        device.called("open")
-        there = card_type == device.card_type and card_identifier == "0"
+    def on_open(self, handle: Handle, card_type: str, card_identifier: str) -> None:
+        there = card_type == self.card_type and card_identifier == "0"
         _refuse(not there, f"there is no {card_type} '{card_identifier}'")
-        _require(device.holder is not self, "open is called twice")
-        _refuse(device.holder is not None, "the board is in use")
-        device.holder = self
+        _require(self.holder is not handle, "open is called twice")
+        _refuse(self.holder is not None, "the board is in use")
+        self.holder = handle
+        self.at_expiry.clear()
 
-    def close(self) -> None:
-        """Close the board and drop its task. Outputs stay as they are. Nothing happens if it is not open."""
-        device = self._device
-        if device.holder is not self:
-            device.calls.append("close")
-            return
-        device.holder = device.task = None
-        device.called("close")
-
-    # ── immediate input and output ──
+    def on_close(self) -> None:
+        """Outputs stay as they are."""
 
     def _write(self, kind: Kind, channels: Any, n: int, values: Any) -> None:
-        self._begin(f"write_{kind}")
         there, dtype, _, low, high = _OUTPUTS[kind]
         numbers = _numbers(channels, n, there)
         _array(values, dtype, n)
         within = all(low <= value <= high for value in values.tolist())  # false for NaN
         _require(within, f"{kind} outputs take {low:g} to {high:g}, not {values.tolist()}")
         self._refuse_if_expired()
-        unguarded = kind == "digital" and values.any() and self._device.watchdog is None
+        unguarded = kind == "digital" and values.any() and self.watchdog is None
         _require(not unguarded, "an amplifier is switched on while no watchdog runs")
         for number, value in zip(numbers, values.tolist(), strict=True):
-            self._device.outputs[kind][number - there[0]] = value
+            self.outputs[kind][number - there[0]] = value
 
-    write_analog = partialmethod(_write, "analog")
-    write_digital = partialmethod(_write, "digital")
+    on_write_analog = partialmethod(_write, "analog")
+    on_write_digital = partialmethod(_write, "digital")
 
-    def set_encoder_counts(self, channels: Any, n: int, counts: Any, /) -> None:
-        self._begin("set_encoder_counts")
+    def on_set_encoder_counts(self, channels: Any, n: int, counts: Any) -> None:
         numbers = _numbers(channels, n, _ENCODERS)
         _array(counts, np.int32, n)
         self._refuse_if_expired()
         for channel, count in zip(numbers, counts.tolist(), strict=True):
-            self._device.set_counts(channel, count)
+            self.set_counts(channel, count)
 
-    def read(self, *inputs_and_buffers: Any) -> None:
-        self._begin("read")
-        inputs, buffers = inputs_and_buffers[:8], inputs_and_buffers[8:]
-        numbers = _inputs(*inputs)
+    def on_read(self, *inputs_and_buffers: Any) -> None:
+        numbers, buffers = _inputs(*inputs_and_buffers[:8]), inputs_and_buffers[8:]
         _check_buffers(*numbers, *buffers)
         self._refuse_if_expired()
-        _fill(self._device.sample(*numbers), *buffers)
+        _fill(self.sample(*numbers), *buffers)
 
-    # ── the reader task ──
-
-    def task_create_reader(self, samples_in_buffer: int, /, *inputs: Any) -> object:
-        self._begin("task_create_reader")
+    def on_task_create_reader(self, samples_in_buffer: int, *inputs: Any) -> object:
         numbers = _inputs(*inputs)
         _require(samples_in_buffer == 1, f"the fake's buffer holds one sample, not {samples_in_buffer!r}")
-        _refuse(self._device.task is not None, "this board has one task")
-        self._device.task = Task(*numbers)
-        return self._device.task
+        _refuse(self.task is not None, "this board has one task")
+        self.task = Task(numbers)
+        return self.task
 
-    def task_set_buffer_overflow_mode(self, task: Any, mode: int, /) -> None:
-        self._begin("task_set_buffer_overflow_mode", task)
-        _require(not task.running, "the overflow mode is set while the task runs")
+    def on_task_set_buffer_overflow_mode(self, task: Any, mode: int) -> None:
+        self._check_task(task, running=False)
         task.mode = mode
 
-    def task_get_buffer_overflows(self, task: Any, /) -> int:
-        self._begin("task_get_buffer_overflows", task)
+    def on_task_get_buffer_overflows(self, task: Any) -> int:
+        self._check_task(task)
         return int(task.overflows)
 
-    def task_start(self, task: Any, clock: int, frequency: float, samples: int, /) -> None:
-        device = self._device
-        self._begin("task_start", task)
-        _require(not task.running, "the task is started twice")
+    def on_task_start(self, task: Any, clock: int, frequency: float, samples: int) -> None:
+        self._check_task(task, running=False)
         _require(clock == Clock.HARDWARE_CLOCK_0, "a hardware clock must pace the loop")
-        other = abs(frequency * device.period - 1) > 1e-9
-        _require(not other, f"the emulated Aero steps at {1 / device.period:g} Hz, not at {frequency:g} Hz")
+        other = abs(frequency * self.period - 1) > 1e-9
+        _require(not other, f"the emulated Aero steps at {1 / self.period:g} Hz, not at {frequency:g} Hz")
         _require(samples == 2**32 - 1, "the task would end by itself")
         task.running = True
-        task.samples.clear()
-        task.overflows = 0
-        device.started_ns = time.monotonic_ns() - round(device.time * device.period * 1e9)
+        self.started_ns = time.monotonic_ns() - round(self.time * self.period * 1e9)
 
-    def task_read(self, task: Any, samples: int, /, *buffers: Any) -> int:
-        device = self._device
-        failure: HILError | None = None
-        try:
-            self._begin("task_read")
-        except HILError as error:
-            failure = error
-        _check_task(task)
-        _require(task.running, "a task is read that was not started")
+    def on_task_read(self, task: Any, samples: int, *buffers: Any) -> int:
+        self._check_task(task, running=True)
         _require(samples == 1, f"one sample makes a period, not {samples}")
-        _check_buffers(task.encoders, task.other, *buffers)
-        if failure is None or not device.realtime:  # by the clock, the sample falls due whether the read fails or not
-            device.wait()
-            sample = task.samples.popleft()
-        if failure is not None:
-            raise failure
-        _fill(sample, *buffers)
+        _check_buffers(*task.channels, *buffers)
+        self.wait()
+        _fill(task.samples.popleft(), *buffers)
         return 1
 
-    def task_stop(self, task: Any, /) -> None:
-        self._begin("task_stop", task)
-        _require(task.running, "a task is stopped that does not run")
+    def on_task_stop(self, task: Any) -> None:
+        self._check_task(task, running=True)
         task.running = False
 
-    def task_delete(self, task: Any, /) -> None:
-        self._begin("task_delete", task)
+    def on_task_delete(self, task: Any) -> None:
+        self._check_task(task)
         _refuse(task.running, "the task still runs")
-        task.deleted = True
-        self._device.task = None
+        self.task = None
 
-    # ── the watchdog ──
+    def _check_task(self, task: Any, running: bool | None = None) -> None:
+        _require(task is not None and task is self.task, "there is no such task")
+        if running is not None:
+            _require(task.running == running, f"the task runs: {task.running}")
 
     def _set_expiration(self, kind: Kind, channels: Any, n: int, values: Any) -> None:
-        self._begin(f"watchdog_set_{kind}_expiration_state")
         there, _, dtype, *_ = _OUTPUTS[kind]
         numbers = _numbers(channels, n, there)
         _array(values, dtype, n)
-        _require(self._device.watchdog is None, "an expiration state is set while the watchdog runs")
+        _require(self.watchdog is None, "an expiration state is set while the watchdog runs")
         _require(numbers == list(there), f"an expiration state omits {kind} outputs")
-        self._device.at_expiry[kind] = values.tolist()
-        self._set.add(kind)
+        self.at_expiry[kind] = values.tolist()
 
-    watchdog_set_analog_expiration_state = partialmethod(_set_expiration, "analog")
-    watchdog_set_digital_expiration_state = partialmethod(_set_expiration, "digital")
+    on_watchdog_set_analog_expiration_state = partialmethod(_set_expiration, "analog")
+    on_watchdog_set_digital_expiration_state = partialmethod(_set_expiration, "digital")
 
-    def watchdog_start(self, timeout: float, /) -> None:
-        device = self._device
-        self._begin("watchdog_start")
+    def on_watchdog_start(self, timeout: float) -> None:
         _require(timeout > 0, f"a watchdog's timeout is positive, not {timeout}")
-        _require({"analog", "digital"} <= self._set, "the watchdog is started before its expiration states are set")
-        _require(device.watchdog is None, "the watchdog is started twice")
+        _require(len(self.at_expiry) == 2, "the watchdog is started before its expiration states are set")
+        _require(self.watchdog is None, "the watchdog is started twice")
         self._refuse_if_expired()
-        device.watchdog = ceil(timeout / device.period - 1e-9)
-        device.reloaded = device.time
+        self.watchdog = ceil(timeout / self.period - 1e-9)
+        self.reloaded = self.time
 
-    def watchdog_reload(self) -> bool:
-        self._begin("watchdog_reload")
-        _require(self._device.watchdog is not None, "a watchdog is reloaded that does not run")
-        self._device.reloaded = self._device.time
-        return not self._device.expired
+    def on_watchdog_reload(self) -> bool:
+        _require(self.watchdog is not None, "a watchdog is reloaded that does not run")
+        self.reloaded = self.time
+        return not self.expired
 
-    def watchdog_is_expired(self) -> bool:
-        self._begin("watchdog_is_expired")
-        return self._device.expired
+    def on_watchdog_is_expired(self) -> bool:
+        return self.expired
 
-    def watchdog_clear(self) -> None:
+    def on_watchdog_clear(self) -> None:
         """Allow writes again, and restore the outputs of before the expiry."""
-        device = self._device
-        self._begin("watchdog_clear")
-        _refuse(not device.expired, "the watchdog has not expired")
-        device.restore(device.before_expiry)
-        device.expired = False
-        device.reloaded = device.time
+        _refuse(not self.expired, "the watchdog has not expired")
+        self.restore(self.before_expiry)
+        self.expired = False
+        self.reloaded = self.time
 
-    def watchdog_stop(self) -> None:
-        self._begin("watchdog_stop")
-        self._device.watchdog = None
-
-    # ── checks ──
-
-    def _begin(self, call: str, *tasks: object) -> None:
-        self._device.called(call)
-        _require(self._device.holder is self, f"{call} on a board that is not open")
-        for task in tasks:
-            _check_task(task)
+    def on_watchdog_stop(self) -> None:
+        self.watchdog = None
 
     def _refuse_if_expired(self) -> None:
-        _refuse(self._device.expired, "the watchdog has expired")
+        _refuse(self.expired, "the watchdog has expired")
+
+
+# ── checks of arguments ──
 
 
 def _require(allowed: bool, message: str) -> None:
@@ -396,10 +354,6 @@ def _require(allowed: bool, message: str) -> None:
 def _refuse(refused: bool, message: str) -> None:
     if refused:
         raise HILError(message)
-
-
-def _check_task(task: object) -> None:
-    _require(isinstance(task, Task) and not task.deleted, "there is no such task")
 
 
 def _numbers(channels: Any, n: int, there: Sequence[int]) -> list[int]:
@@ -417,15 +371,13 @@ def _array(array: Any, dtype: type[np.generic], n: int) -> None:
     """Check an array for C, which would misread another type and read past the end of a shorter one."""
     if array is None and n == 0:
         return
-    fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == (n,)
-    _require(fits, f"an array of {n} {dtype.__name__} is required, not {array!r}")
-    _require(array.flags.c_contiguous, "C needs an array that is contiguous")
+    fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == (n,) and array.flags.c_contiguous
+    _require(fits, f"a contiguous array of {n} {dtype.__name__} is required, not {array!r}")
 
 
-def _inputs(
-    analog: Any, n_analog: int, encoders: Any, n_encoders: int, digital: Any, n_digital: int, other: Any, n_other: int
-) -> tuple[list[int], list[int]]:
+def _inputs(*inputs: Any) -> tuple[list[int], list[int]]:
     """Numbers of the encoder and the other channels to read."""
+    analog, n_analog, encoders, n_encoders, digital, n_digital, other, n_other = inputs
     unread = analog is None and not n_analog and digital is None and not n_digital
     _require(unread, "the fake reads encoders and other channels only")
     return _numbers(encoders, n_encoders, _ENCODERS), _numbers(other, n_other, _GYRO)

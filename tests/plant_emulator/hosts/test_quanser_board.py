@@ -27,7 +27,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from tests.support import fake_quanser
 from tests.support.clock import FakeClock
-from tests.support.fake_quanser import BufferOverflowMode, FakeQuanser
+from tests.support.fake_quanser import BufferOverflowMode, Clock, FakeQuanser, HILError
 from tests.support.plant_end import claim_of
 
 PERIOD = 0.002
@@ -52,11 +52,11 @@ def plant_on_board(
 
 def plant_of(board: FakeQuanser, settings: QuanserSettings = AERO.quanser) -> QuanserPlant:
     """A plant on this board, which is what `import quanser.hardware` finds."""
-    names = {"HIL": board.HIL, "HILError": board.HILError, "Clock": board.Clock}
+    names = {"HIL": board.HIL, "HILError": HILError, "Clock": Clock}
     for module, of in (
         ("quanser", {}),
         ("quanser.hardware", names),
-        ("quanser.hardware.enumerations", {"BufferOverflowMode": board.BufferOverflowMode}),
+        ("quanser.hardware.enumerations", {"BufferOverflowMode": BufferOverflowMode}),
     ):
         sys.modules[module] = ModuleType(module)
         sys.modules[module].__dict__.update(of)
