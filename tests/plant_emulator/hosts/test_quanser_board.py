@@ -31,6 +31,7 @@ from tests.support.fake_quanser import BufferOverflowMode, Clock, FakeQuanser, H
 from tests.support.plant_end import claim_of
 
 PERIOD = 0.002
+PERIOD_NS = 2_000_000
 WATCHDOG = 50
 """Samples in 0.1 s."""
 AERO = PlantSettings(voltage_limit=18.0)
@@ -38,12 +39,10 @@ OFF = (0.0, 0.0)
 VOLTS = (9.0, -12.0)
 
 
-def plant_on_board(
-    settings: PlantSettings = AERO, *, realtime: bool = False, session: bool = True, **changed: Any
-) -> tuple[QuanserPlant, FakeQuanser]:
+def plant_on_board(*, realtime: bool = False, session: bool = True, **changed: Any) -> tuple[QuanserPlant, FakeQuanser]:
     """A plant that was just opened, and its board; `changed` are fields of QuanserSettings."""
     quanser = QuanserSettings(**changed)
-    board = FakeQuanser(settings, PERIOD, card_type=quanser.card_type, realtime=realtime)
+    board = FakeQuanser(AERO, PERIOD, card_type=quanser.card_type, realtime=realtime)
     plant = plant_of(board, quanser)
     if session:
         plant.enable(True)
@@ -87,9 +86,9 @@ def expired_plant() -> tuple[QuanserPlant, FakeQuanser]:
     return plant, board
 
 
-def emulated_aero(settings: PlantSettings = AERO, counts: tuple[int, int] = (2880, 4096)) -> EmulatedPlant:
+def emulated_aero(counts: tuple[int, int] = (2880, 4096)) -> EmulatedPlant:
     """The same Aero without a board: an Aero 2's encoders unless given."""
-    return settings.model_copy(update={"sensors": SensorSettings(counts=counts)}).build(PERIOD)
+    return AERO.model_copy(update={"sensors": SensorSettings(counts=counts)}).build(PERIOD)
 
 
 def is_nothing(seen: Measurement) -> bool:
@@ -159,7 +158,7 @@ def test_a_board_that_was_left_under_an_expired_watchdog_is_had_again_at_0_v() -
     assert board.analog == [0.0, 0.0]  # not only behind a switch
 
 
-def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None:
+def test_a_board_that_cannot_be_had_or_started_is_one_line_and_is_closed() -> None:
     _, board = plant_on_board()
     for settings, words in [
         (QuanserSettings(card_type="quanser_aero_usb"), "quanser_aero_usb '0': there is no quanser_aero_usb '0'; .*?"),
@@ -168,9 +167,6 @@ def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None
     ]:
         with pytest.raises(PlantError, match=f"cannot open {words}"):
             plant_of(board, settings)
-
-
-def test_a_board_that_cannot_be_made_ready_is_closed_and_one_that_cannot_be_started_is_reported() -> None:
     board = FakeQuanser(AERO, PERIOD)
     board.fail_next("task_create_reader")
     with pytest.raises(PlantError, match="cannot make quanser_aero2_usb '0' ready: task_create_reader was made"):
@@ -184,29 +180,20 @@ def test_a_board_that_cannot_be_made_ready_is_closed_and_one_that_cannot_be_star
     assert board.holder is None
 
 
-@pytest.mark.parametrize("failing", ["write_analog", "task_stop", "none", "all"])
-def test_closing_goes_on_when_a_step_fails(failing: str) -> None:
+@pytest.mark.parametrize("failing", ["write_analog", "task_stop", "both writes", "none", "all"])
+def test_closing_goes_on_when_a_step_fails_and_leaves_to_the_watchdog_what_it_could_not_do(failing: str) -> None:
     plant, board = driven_plant()
     if failing == "all":
         board.unplug()
-    elif failing != "none":
-        board.fail_next(failing)
-    board.calls.clear()
-    plant.close()
-    plant.close()
-    assert list(board.calls) == [call for call in CLOSING if failing != "all" or call != "watchdog_stop"]  # once
-    assert board.motor_voltages == (VOLTS if failing == "all" else OFF)
-    assert board.holder is None
-
-
-def test_the_watchdog_is_left_to_do_what_closing_could_not() -> None:
-    plant, board = driven_plant()
-    for call in ("write_analog", "write_digital"):
+    for call in {"none": (), "all": (), "both writes": ("write_analog", "write_digital")}.get(failing, (failing,)):
         board.fail_next(call)
     board.calls.clear()
     plant.close()
-    assert "watchdog_stop" not in board.calls
-    assert board.watchdog is not None
+    plant.close()
+    left = failing in ("all", "both writes")
+    assert list(board.calls) == [call for call in CLOSING if not left or call != "watchdog_stop"]  # once
+    assert board.motor_voltages == (VOLTS if left else OFF)
+    assert (board.holder, board.watchdog is not None) == (None, left)
 
 
 @pytest.mark.parametrize(
@@ -247,9 +234,6 @@ def test_an_amplifier_that_could_not_be_switched_is_switched_at_the_next_tick() 
     assert (board.enabled, board.analog) == ([True, True], [0.0, 0.0])
     plant.actuate(OFF)
     assert board.enabled == [False, False]
-
-
-# The watchdog
 
 
 def test_a_loop_that_stands_still_leaves_the_motors_at_0_v_when_the_watchdogs_time_is_over() -> None:
@@ -317,15 +301,17 @@ def test_outputs_that_cannot_be_had_back_stay_at_0_v_until_they_can(call: str) -
     assert board.truth().voltages == VOLTS
 
 
-def test_a_command_that_could_not_be_written_does_not_reload_the_watchdog() -> None:
+@pytest.mark.parametrize("call", ["task_read", "write_analog"])
+def test_a_failed_call_reloads_no_watchdog_and_after_a_failed_read_no_old_sample_is_measured(call: str) -> None:
     plant, board = driven_plant()
-    board.fail_next("write_analog")
+    board.fail_next(call)
     for reloads in (False, True):
         board.calls.clear()
         drive(plant, 1)
         assert ("watchdog_reload" in board.calls) == reloads
-        assert not is_nothing(plant.measure())  # what it sees is true all the same
-    assert plant.failures == 1
+        assert is_nothing(plant.measure()) == (call == "task_read" and not reloads)
+        assert plant.passed == 1
+    assert plant.note == f"the board: 1 failed calls, the last: {call} was made to fail"
 
 
 @pytest.mark.parametrize("call", ["task_read", "write_analog", "write_digital"])
@@ -343,9 +329,6 @@ def test_where_reads_or_writes_fail_for_long_the_board_goes_to_0_v_by_itself(cal
     assert board.expired
 
 
-PERIOD_NS = 2_000_000
-
-
 @pytest.mark.parametrize(
     ("card", "counts", "voltages", "periods", "yaw"),
     [
@@ -358,7 +341,7 @@ def test_measurements_are_those_of_an_emulated_aero_with_the_cards_encoders(
 ) -> None:
     """To the last bit: encoders, filter and body are the same pieces, also where yaw has turned more than once."""
     plant, board = plant_on_board(card_type=card)
-    twin = emulated_aero(counts=counts)
+    twin = emulated_aero(counts)
     assert plant.measure() == Measurement(IDENTITY, (0.0, 0.0, 0.0))
     for _ in range(periods):
         for each in (plant, twin):
@@ -384,23 +367,6 @@ def test_a_gyros_rates_need_no_filter_and_its_axes_can_be_set() -> None:
     assert plant.measure().rate == (z, -x, -y)
 
 
-# Reads that fail
-
-
-def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchdog() -> None:
-    plant, board = driven_plant()
-    board.fail_next("task_read")
-    board.calls.clear()
-    drive(plant, 1)
-    assert is_nothing(plant.measure())
-    assert "watchdog_reload" not in board.calls
-    drive(plant, 1)
-    assert not is_nothing(plant.measure())
-    assert plant.failures == 1
-    assert plant.note == "the board: 1 failed calls, the last: task_read was made to fail"
-    assert plant.passed == 1
-
-
 def test_after_a_failed_read_the_attitude_is_the_joints_and_the_filter_starts_anew() -> None:
     plant, board = driven_plant()
     twin = emulated_aero()
@@ -411,9 +377,6 @@ def test_after_a_failed_read_the_attitude_is_the_joints_and_the_filter_starts_an
     assert plant.measure().attitude == twin.measure().attitude
     assert twin.measure().rate[2] != 0.0
     assert plant.measure().rate == (0.0, 0.0, 0.0)  # at rest until the filter has seen more
-
-
-# Samples that are not read in time
 
 
 def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_count_and_measure_nothing() -> None:
@@ -437,9 +400,6 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
     assert (board.time, plant.passed) == (now + 1, 1)
 
 
-# A board that samples by the clock
-
-
 def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: FakeClock) -> None:
     """They return at once, and samples go on coming: those are not counted twice."""
     plant, board = plant_on_board(realtime=True)
@@ -456,10 +416,8 @@ def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: Fa
     assert plant.failures == 10
 
 
-def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_trips_in_the_time_of_its_guard() -> (
-    None
-):
-    plant, board = plant_on_board()
+def test_one_lost_sample_does_not_end_a_session_and_an_unplugged_board_trips_in_the_time_of_its_limit() -> None:
+    plant, board = plant_on_board(session=False)
     settings = Settings()
     wire, loop = settings.wire, LoopSettings(lockstep=True)
     endpoint = settings.plant.endpoint(plant, loop, wire)
@@ -470,7 +428,7 @@ def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_
         if k == 100:
             board.fail_next("task_read")
         if k == 200:
-            assert endpoint.state is PlantState.DRIVEN
+            assert (endpoint.state, board.enabled) == (PlantState.DRIVEN, [True, True])  # by the endpoint
             assert (controller.invalid, plant.failures) == (1, 1)
             board.unplug()
         if measurement is None:
