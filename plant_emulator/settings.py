@@ -17,8 +17,8 @@ from aeroloop.plant_emulator.model.emulated import (
     RotorSettings,
     Sensors,
     SensorSettings,
-    Wind,
     WindSettings,
+    wind_torques,
 )
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
 from aeroloop.protocol.wire.spec import WATCHDOG_S, LoopSettings, WireSpec
@@ -147,7 +147,7 @@ class PlantSettings(BaseModel, extra="forbid"):
     def build(self, period: float) -> EmulatedPlant:
         """As `make`, of an emulated body; raises PlantError for any other kind."""
         mechanism, limit = self.mechanism(), self.voltage_limit
-        wind, sensors = Wind(self.wind, mechanism.axes, period), Sensors(self.sensors, period)
+        wind, sensors = wind_torques(self.wind, mechanism.axes, period), Sensors(self.sensors, period)
         return EmulatedPlant(mechanism, self.rotor, self.friction, wind, sensors, period, limit)
 
     def endpoint(self, plant: Plant, loop: LoopSettings, wire: WireSpec) -> Endpoint:

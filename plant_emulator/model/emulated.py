@@ -63,13 +63,6 @@ def rotor_derivative(settings: RotorSettings, state: ca.SX, command: ca.SX) -> c
     return (command - state) / ca.if_else(rising, settings.lag_up_s, settings.lag_down_s)
 
 
-def thrust_voltage(settings: RotorSettings, state: ca.SX) -> ca.SX:
-    """Voltage beyond the dead zone [V]. Shape as given."""
-    if not settings.dead_zone_v:
-        return state
-    return ca.sign(state) * ca.fmax(ca.fabs(state) - settings.dead_zone_v, 0)
-
-
 class FrictionSettings(BaseModel, extra="forbid"):
     """Friction about the axes: pitch and yaw of the Aero, x, y, z of a free body (missing ones are 0)."""
 
@@ -115,34 +108,27 @@ class WindSettings(BaseModel, extra="forbid"):
     seed: int = Field(default=0, ge=0, description="of the gusts' random numbers")
 
 
-class Wind:
-    """Torque about each axis, `period` by `period` [s]; `calm` if it is always 0.
+def wind_torques(settings: WindSettings, axes: int, period: float) -> Iterator[list[float]] | None:
+    """Torque about each axis [N·m], shape (axes,), `period` by `period` [s]; None if it is always 0.
 
     A gust is an Ornstein–Uhlenbeck process (the same filter as Dryden's longitudinal gust) with time constant
     `gust_time_s` and a standard deviation of `gust` times the steady torque; seeded, so that a run repeats, and stepped
     exactly, so that its statistics do not depend on the period.
     """
+    steady = [torque * settings.blowing for torque in (*settings.torque, 0.0, 0.0, 0.0)[:axes]]
+    deviation = settings.gust * hypot(*steady) / sqrt(axes)
+    keep = exp(-period / settings.gust_time_s)
 
-    def __init__(self, settings: WindSettings, axes: int, period: float) -> None:
-        self._steady = [torque * settings.blowing for torque in (*settings.torque, 0.0, 0.0, 0.0)[:axes]]
-        self.calm = not any(self._steady)
-        self._deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
-        self._keep = exp(-period / settings.gust_time_s)
-        self._random = np.random.default_rng(settings.seed)
-        self._torques = self._blow()
-
-    def sample(self) -> list[float]:
-        """Torque about each axis for the next period [N·m]. Shape (axes,)."""
-        return next(self._torques)
-
-    def _blow(self) -> Iterator[list[float]]:
-        axes, keep = len(self._steady), self._keep
-        gust = (self._deviation * self._random.standard_normal(axes)).tolist()
-        kick = self._deviation * sqrt(1 - keep**2)
+    def blow() -> Iterator[list[float]]:
+        random = np.random.default_rng(settings.seed)
+        gust = (deviation * random.standard_normal(axes)).tolist()
+        kick = deviation * sqrt(1 - keep**2)
         while True:
-            for kicks in (self._random.standard_normal((_BLOCK, axes)) * kick).tolist():
+            for kicks in (random.standard_normal((_BLOCK, axes)) * kick).tolist():
                 gust = [keep * old + new for old, new in zip(gust, kicks, strict=True)]
-                yield [steady + part for steady, part in zip(self._steady, gust, strict=True)]
+                yield [torque + part for torque, part in zip(steady, gust, strict=True)]
+
+    return blow() if any(steady) else None
 
 
 # ── sensors: a sample is one CasADi function ──
@@ -173,41 +159,36 @@ class SensorSettings(BaseModel, extra="forbid"):
         return self.attitude == "encoders" or self.rate == "derivative"
 
 
-class FilteredDerivative:
+def filtered_derivative(bandwidth: float, period: float) -> Callable[[Scalar, Scalar, Scalar], tuple[Scalar, Scalar]]:
     """The rate of a sampled angle, by the filter ωn² s / (s² + 2ζωn s + ωn²), exact for an angle held over a period.
 
-    `bandwidth` is ωn [rad/s], and `period` the time between samples [s].
+    `bandwidth` is ωn [rad/s], and `period` the time between samples [s]. Returns a function of the filtered angle [rad]
+    and rate [rad/s] and a sample [rad], which gives angle and rate after it.
     """
+    decay, ringing = DAMPING_RATIO * bandwidth, bandwidth * sqrt(1 - DAMPING_RATIO**2)
+    envelope, c, s = exp(-decay * period), cos(ringing * period), sin(ringing * period) / ringing
+    from_lag, from_rate = envelope * (c + decay * s), envelope * s
+    rate_from_lag, rate_from_rate = -envelope * bandwidth**2 * s, envelope * (c - decay * s)
 
-    def __init__(self, bandwidth: float, period: float) -> None:
-        decay = DAMPING_RATIO * bandwidth
-        ringing = bandwidth * sqrt(1 - DAMPING_RATIO**2)
-        envelope, c, s = exp(-decay * period), cos(ringing * period), sin(ringing * period) / ringing
-        self._from_lag = envelope * (c + decay * s)
-        self._from_rate = envelope * s
-        self._rate_from_lag = -envelope * bandwidth**2 * s
-        self._rate_from_rate = envelope * (c - decay * s)
-
-    def after(self, held: Scalar, rate: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
-        """Filtered angle [rad] and rate [rad/s] after a sample [rad], from those before it."""
+    def after(held: Scalar, rate: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
         lag = held - angle
-        return (
-            angle + self._from_lag * lag + self._from_rate * rate,
-            self._rate_from_lag * lag + self._rate_from_rate * rate,
-        )
+        return angle + from_lag * lag + from_rate * rate, rate_from_lag * lag + rate_from_rate * rate
+
+    return after
 
 
 class Sensors:
     """Sensors of one plant, sampled once a `period` [s].
 
-    `zeros` are those of pitch and yaw encoders, within a step [1], random unless given.
+    `zeros` are those of pitch and yaw encoders, within a step [1], random unless given; `errors` draws a gyro's next
+    error, noise and bias [rad/s].
     """
 
     def __init__(self, settings: SensorSettings, period: float, zeros: list[float] | None = None) -> None:
         self._settings = settings
         self._random = np.random.default_rng(settings.seed)
         self.zeros: list[float] = zeros or self._random.random(len(settings.counts)).tolist()
-        self._errors = self._draw()
+        self.errors = self._draw()
         self._compiled = Compiled(sensor_function(settings, period))
         given = self._compiled.inputs
         self._held, self._error = given["held"], given["error"]
@@ -228,7 +209,7 @@ class Sensors:
         if self._settings.of_joints:
             given["angles"][:] = array("d", angles)
         if self._settings.rate == "gyro":
-            self._error[:] = array("d", self.error())
+            self._error[:] = array("d", next(self.errors))
         self._compiled.evaluate()
         self._held[:] = self._compiled.outputs["after"]
         w, x, y, z, a, b, c = self._compiled.outputs["seen"].tolist()
@@ -238,10 +219,6 @@ class Sensors:
     def held(self) -> list[float]:
         """Memory of the filters; see `sensor_function`."""
         return self._held.tolist()  # type: ignore[return-value]  # doubles
-
-    def error(self) -> Vector:
-        """Draw a gyro's next error, noise and bias [rad/s]."""
-        return next(self._errors)
 
     def _draw(self) -> Iterator[Vector]:
         noise, bias = self._settings.gyro_noise, self._settings.gyro_bias
@@ -268,12 +245,12 @@ def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
             cp, sp, cy, sy = ca.cos(pitch / 2), ca.sin(pitch / 2), ca.cos(yaw / 2), ca.sin(yaw / 2)
             attitude = ca.vertcat(cy * cp, -sy * sp, cy * sp, sy * cp)  # yaws, then pitches
         if settings.rate == "derivative":
-            derivative = FilteredDerivative(settings.bandwidth, period)
+            derivative = filtered_derivative(settings.bandwidth, period)
             last = [
                 ca.if_else(filtered == filtered, filtered, now) for filtered, now in ((held[0], pitch), (held[2], yaw))
             ]
-            of_pitch = derivative.after(last[0], held[1], pitch)
-            of_yaw = derivative.after(last[1], held[3], yaw)
+            of_pitch = derivative(last[0], held[1], pitch)
+            of_yaw = derivative(last[1], held[3], yaw)
             rate, after = ca.vertcat(*rate_of(pitch, of_pitch[1], of_yaw[1])), ca.vertcat(*of_pitch, *of_yaw)
         elif settings.rate == "gyro":
             rate = rate + error
@@ -318,7 +295,9 @@ def step_function(
 
     def derivative(state: ca.SX) -> ca.SX:
         body, rotors = state[0:n], state[n:]
-        voltages = thrust_voltage(rotor, rotors if rotor.present else u)
+        voltages, zone = rotors if rotor.present else u, rotor.dead_zone_v
+        if zone:
+            voltages = ca.sign(voltages) * ca.fmax(ca.fabs(voltages) - zone, 0)
         *_, axis_rates, _ = mechanism.outputs(body)
         body_dot = mechanism.derivative(body, voltages, friction_torque(friction, axis_rates) + wind)
         return ca.vertcat(body_dot, rotor_derivative(rotor, rotors, u)) if rotor.present else body_dot
@@ -345,7 +324,7 @@ class EmulatedPlant(Plant):
         mechanism: Mechanism,
         rotor: RotorSettings,
         friction: FrictionSettings,
-        wind: Wind,
+        wind: Iterator[list[float]] | None,
         sensors: Sensors,
         period: float,
         voltage_limit: float,
@@ -364,8 +343,8 @@ class EmulatedPlant(Plant):
         self._u[:] = array("d", [max(-limit, min(limit, voltage)) for voltage in voltages])
 
     def advance(self) -> None:
-        if not self._wind.calm:
-            self._load[:] = array("d", self._wind.sample())
+        if self._wind is not None:
+            self._load[:] = array("d", next(self._wind))
         self._step.evaluate()
         after, attitude, rate, angles = self._step.outputs.values()
         self._x[:] = after

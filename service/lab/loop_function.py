@@ -25,11 +25,11 @@ import numpy as np
 from aeroloop.plant_emulator.endpoint.endpoint import LimitSettings
 from aeroloop.plant_emulator.model.emulated import (
     Sensors,
-    Wind,
     WindSettings,
     initially,
     sensor_function,
     step_function,
+    wind_torques,
 )
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, level, numbers, with_numbers
@@ -177,7 +177,7 @@ class Loop:
     def inputs(self, settings: Settings, ticks: int) -> dict[str, Floats]:
         """Inputs of every tick, by name, a row each; the state at the first. Random numbers as the plant draws them."""
         plant, wire, period = settings.plant, settings.wire, settings.loop.period
-        wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
+        wind, sensors = wind_torques(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
         seen = sensors.read(*self._initially)
         held = [np.nan] * (6 + wire.actuators)
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
@@ -186,10 +186,10 @@ class Loop:
         first = [*x, *IDENTITY, *law.state, *seen.attitude, *seen.rate, *sensors.held, *held]
         state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros, *law.gains])
         torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
-        if not wind.calm:
-            torque[:] = [wind.sample() for _ in range(ticks)]
+        if wind is not None:
+            torque[:] = [next(wind) for _ in range(ticks)]
         if plant.sensors.rate == "gyro":
-            error[:] = [sensors.error() for _ in range(ticks)]
+            error[:] = [next(sensors.errors) for _ in range(ticks)]
         return {"state": state, "desired": self._wanted(settings, ticks), "wind": torque, "error": error}
 
     def _wanted(self, settings: Settings, ticks: int) -> Floats:

@@ -19,7 +19,6 @@ from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 
 
-
 def _asymmetric(rng: np.random.Generator) -> dict[str, object]:
     """A body without any symmetry: three inertias, a centre of mass off every axis, damping about each."""
     return {
