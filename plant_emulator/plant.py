@@ -23,8 +23,7 @@ from aeroloop.protocol.wording import problems
 
 T = TypeVar("T")
 
-EMULATED: Final = ("aero", "rigid_body")
-"""Kinds that are not a class but a body of the emulated plant."""
+EMULATED: Final = ("aero", "rigid_body")  # kinds that are not a class but a body of the emulated plant
 
 BUILT_IN: Final = {
     **dict.fromkeys(EMULATED, "aeroloop.plant_emulator.model.emulated:EmulatedPlant"),

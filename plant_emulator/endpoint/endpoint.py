@@ -63,10 +63,6 @@ class Freshness:
     Why the first command of a session has a deadline of its own: commands late by a whole round of the counter would
     look fresh, so the first one must be received before the counter is back at 0. A counter shorter than twice the
     watchdog's time cannot detect this, and gets the usual time.
-
-    Attributes:
-        answered, echo: Session tick that the last fresh command answers, and its counter; −1 for none.
-        since_ns: Since when the next command is waited for; None while there is nothing to answer.
     """
 
     def __init__(self, counters: int, period_ns: int, watchdog_s: float) -> None:
@@ -82,8 +78,8 @@ class Freshness:
 
     def reset(self) -> None:
         """Forget the session; the next one has no measurement yet."""
-        self.echo = self.answered = -1
-        self.since_ns: int | None = None
+        self.echo = self.answered = -1  # counter and session tick that the last fresh command answers
+        self.since_ns: int | None = None  # the next command is waited for; None while there is nothing to answer
         self._limit_ns = _FIRST_COMMAND_NS
 
     def measured(self, now_ns: int | None) -> None:
@@ -91,10 +87,7 @@ class Freshness:
         self.since_ns, self._limit_ns = now_ns, self._first_ns
 
     def judge(self, echo: int, session_tick: int, now_ns: int) -> Outcome:
-        """Judge a command, received after the measurement of a session's tick: ACTED if fresh, REPEATED or STALE.
-
-        A repeated echo is refused: after a whole round of the counter it would look fresh again.
-        """
+        """Judge a command, received after the measurement of a session's tick: ACTED if fresh, REPEATED or STALE."""
         age = (session_tick - echo) % self._counters
         if echo == self.echo or session_tick - age <= self.answered:
             return Outcome.REPEATED
@@ -114,37 +107,24 @@ class Freshness:
 
 
 class VehicleClaim:
-    """A plant that one controller at a time may drive: base of the Endpoint and of the CAN bridge's Relay.
-
-    Attributes:
-        trip: Cause of the last trip, until it is cleared.
-        cause: Why the latch refuses claims, or None.
-        operator_only: Whether only an operator's `arm` clears the latch.
-        unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
-        last: Record of the last session, for the next controller; None if it left none.
-        notices, changes: Events, and changes for the trace, since the owner last emptied these lists.
-        ticked: Index of the last tick; −1 before the first.
-        outcome: How the last tick judged the command received before it.
-        voltages: In force from the last tick to the next command [V]. Shape (actuators,).
-        refused, stale: Malformed and stale frames so far.
-    """
+    """A plant that one controller at a time may drive: base of the Endpoint and of the CAN bridge's Relay."""
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
         self.wire, self.period_ns, self.lockstep = wire, period_ns, lockstep
         self.session: str | None = None
         self.holder: str | None = None
-        self.trip: TripCause | None = None
-        self.cause: str | None = None if armed else "not armed since it was started"
-        self.operator_only = False
-        self.unavailable: str | None = None
-        self.last: SessionRecord | None = None
-        self.notices: list[Notice] = []
-        self.changes: list[PlantChange] = []
-        self.ticked = -1
-        self.outcome = Outcome.NONE
+        self.trip: TripCause | None = None  # cause of the last trip, until it is cleared
+        self.cause: str | None = None if armed else "not armed since it was started"  # why the latch refuses claims
+        self.operator_only = False  # whether only an operator's `arm` clears the latch
+        self.unavailable: str | None = None  # the owner's reason to refuse every claim, such as a bus fault
+        self.last: SessionRecord | None = None  # of the last session, for the next controller
+        self.notices: list[Notice] = []  # events since the owner last emptied the list
+        self.changes: list[PlantChange] = []  # likewise, for the trace
+        self.ticked = -1  # index of the last tick
+        self.outcome = Outcome.NONE  # how the last tick judged the command received before it
         self.off = (0.0,) * wire.actuators
-        self.voltages: tuple[float, ...] = self.off
-        self.refused = self.stale = 0
+        self.voltages: tuple[float, ...] = self.off  # in force from the last tick to the next command [V]
+        self.refused = self.stale = 0  # frames so far
         self._record: SessionRecord | None = None  # of the running session
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self._counters = wire.measurement.counters
@@ -210,10 +190,7 @@ class VehicleClaim:
         return Grant(session=claim.session, last=self.last)
 
     def keep(self, record: SessionRecord) -> bool:
-        """Keep the record of the running session, until its end or the next one. False if it is of another session.
-
-        It changes nothing that a tick does, so it is no PlantChange.
-        """
+        """Keep the running session's record; False if it is of another one. It changes no tick, so no PlantChange."""
         if self.session is None or (record.session, record.controller) != (self.session, self.holder):
             return False
         self._record = record
@@ -333,11 +310,7 @@ class VehicleClaim:
 class Endpoint(VehicleClaim):
     """One plant behind its injected faults. At its `limits`, if there are any, it trips, too.
 
-    Raises:
-        ValueError: The wire commands another number of actuators than the plant has.
-
-    Attributes:
-        outgoing: After a tick, the frames to send in order: what the faults of frames leave of the measurement.
+    Raises ValueError if the wire commands another number of actuators than the plant has.
     """
 
     def __init__(
@@ -356,7 +329,7 @@ class Endpoint(VehicleClaim):
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
         super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.plant = plant
-        self.outgoing: list[bytes] = []
+        self.outgoing: list[bytes] = []  # after a tick: what the faults of frames leave of the measurement, in order
         self._faults, self._limits = faults or Faults(plant.actuators, period_ns * 1e-9), limits
         self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
         self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]

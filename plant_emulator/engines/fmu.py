@@ -23,8 +23,7 @@ from aeroloop.protocol.wire.attitude import Quaternion
 
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 
-_FATAL: Final = 4
-"""FMI's status after which the FMU must not be called again."""
+_FATAL: Final = 4  # FMI's status after which the FMU must not be called again
 
 
 class FmuSettings(BaseModel, extra="forbid", frozen=True):

@@ -19,9 +19,7 @@ from aeroloop.plant_emulator.faults.language import BY_CHANCE, SIGNALS, Fault, F
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import FaultStatus
 
-MAX_FAULTS: Final = 64
-"""Faults that may act or be to come at the same time; as many that are over are remembered."""
-
+MAX_FAULTS: Final = 64  # that may act or be to come at the same time; as many that are over are remembered
 GARBLED_RATE: Final = 10.0  # bound of a garbled angular velocity about each axis, ± [rad/s]
 
 Random: TypeAlias = np.random.Generator
@@ -225,15 +223,10 @@ class Faults:
     # ── injection ──
 
     def inject(self, faults: Sequence[Fault], source: Source, *, clear: bool = False) -> list[Transition]:
-        """Add faults with start and end counted from now; if `clear`, remove all others first.
+        """Add faults with start and end counted from now; if `clear`, remove all others first, and return their ends.
 
-        The current sample stays unchanged; frames that a removed fault holds back are lost.
-
-        Returns:
-            The ends of the faults removed.
-
-        Raises:
-            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
+        The current sample stays unchanged; frames that a removed fault holds back are lost. Raises FaultError if a
+        fault is of a motor that the plant does not have, or there are too many; then nothing has changed.
         """
         for fault in faults:
             if fault.target.whole == "motors" and (fault.target.part or 0) >= self._actuators:

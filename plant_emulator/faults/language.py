@@ -12,7 +12,6 @@ values, with their reasons.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from math import ulp
 from typing import Final, NamedTuple
@@ -21,8 +20,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
 MAX_DELAY_S: Final = 10.0
-MAX_TIME_S: Final = 1e8
-"""Latest begin and end [s]; three years."""
+MAX_TIME_S: Final = 1e8  # latest begin and end; three years
 
 KINDS: Final = {  # what each changes things into
     "off": "dropped",  # a sensor without a valid value, a motor at 0 V; no frame passes
@@ -35,8 +33,7 @@ KINDS: Final = {  # what each changes things into
     "duplicate": "duplicated",  # by chance a frame passes again a tick later
     "reorder": "reordered",  # by chance a frame passes after the next one
 }
-BY_CHANCE: Final = ("drop", "garble", "duplicate", "reorder")
-"""Kinds whose value is a probability."""
+BY_CHANCE: Final = ("drop", "garble", "duplicate", "reorder")  # their value is a probability
 
 
 class Signal(NamedTuple):
@@ -86,11 +83,11 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
-            raise ValueError(f"there is no signal {self.signal!r}; there are {_listed(SIGNALS)}")
+            raise ValueError(f"there is no signal {self.signal!r}; there are {', '.join(SIGNALS)}")
         whole, kinds = self.target.whole, self.target.kinds
         if self.kind not in kinds:
             as_a_whole = f"; {whole} as a whole does" if self.kind in SIGNALS[whole].kinds else ""
-            raise ValueError(f"{self.signal} takes no {self.kind!r}, but {_listed(kinds)}{as_a_whole}")
+            raise ValueError(f"{self.signal} takes no {self.kind!r}, but {', '.join(kinds)}{as_a_whole}")
         self._check_value()
         start, end = self.start_s, self.end_s
         if not 0 <= start <= MAX_TIME_S:
@@ -127,8 +124,8 @@ class Fault:
         try:
             if not colon:
                 raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
-            size = _number(value) if equals else None
-            return cls(signal, kind, size, _number(start) if at else 0.0, _number(end) if dots else None)
+            size = float(value) if equals else None
+            return cls(signal, kind, size, float(start) if at else 0.0, float(end) if dots else None)
         except ValueError as error:
             raise FaultError(f"fault {text!r}: {error}") from None
 
@@ -149,17 +146,5 @@ class Fault:
         return f"{self.target.counted} {KINDS[self.kind]}"
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is not a number") from None
-
-
 def _text(value: float) -> str:
     return repr(value).removesuffix(".0")  # reads back as the same float
-
-
-def _listed(words: Iterable[str]) -> str:
-    *most, last = words
-    return f"{', '.join(most)} and {last}"

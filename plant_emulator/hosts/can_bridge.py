@@ -60,10 +60,7 @@ class Relay(VehicleClaim):
         return frame
 
     def command(self, frame: bytes, now_ns: int) -> bytes | None:
-        """Take a frame from the session's controller. Returns it if it is to be forwarded.
-
-        A stale command is forwarded, too, but does not reset the watchdog; the node judges it again.
-        """
+        """Take a controller's frame; returns it to forward, even if stale: the node judges it again."""
         if self.session is None:
             return None
         self._judged = self._command(frame, now_ns)

@@ -89,17 +89,12 @@ class CanNetwork(PlantNetwork):
         if peer.fingerprint != self._fingerprint:
             self._warn("fingerprint", "refused", "the controller's side has another wire spec, so it is not followed")
             return
-        self._number = peer.number
+        self._number, session = peer.number, f"can-{peer.number}"
         self._bus.take()  # drop a frame from before the session
+        # It arms the node: the bridge holds the latch and decides on claims.
+        period_ns, lockstep, wire = self._loop.period_ns, self._loop.lockstep, self._endpoint.wire
         self._endpoint.claim(
-            Claim(
-                controller=MASTER,
-                session=f"can-{peer.number}",
-                period_ns=self._loop.period_ns,
-                lockstep=self._loop.lockstep,
-                auto_arm=True,  # the bridge holds the latch and decides on claims
-                wire=self._endpoint.wire,
-            )
+            Claim(controller=MASTER, session=session, period_ns=period_ns, lockstep=lockstep, auto_arm=True, wire=wire)
         )
 
     def _log(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:

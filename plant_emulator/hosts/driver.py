@@ -17,28 +17,19 @@ from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
 IDLE_WAIT_S: Final = 0.02
-ANSWER_SHARE: Final = 0.6
-"""With hardware, the loop waits for the answer to a sample for this share of the period."""
+ANSWER_SHARE: Final = 0.6  # of the period: with hardware, the loop waits so long for the answer to a sample
 ANSWER_TIMEOUT_S: Final = 2.0
-"""Longest wait for an answer in lockstep, where the watchdog, counted in ticks, stands still. A live controller answers
-within milliseconds, with a law in Python within a second."""
+"""Longest wait for an answer in lockstep, where the watchdog stands still; a law in Python may take a second."""
 
 
 class PlantNetwork(ABC):
-    """Network side of a driver, which alone calls it: ZenohNetwork on Zenoh, CanNetwork on a CAN bus.
-
-    Attributes:
-        timing: Timing of the driver's loop; None in lockstep.
-        skipped, sent: Ticks of sessions that the driver missed, and measurement frames sent, so far.
-        notes: What a status says of the machine, such as real-time settings that it refused.
-        steps: Steps that lockstep may still take; None for no limit.
-    """
+    """Network side of a driver, which alone calls it: ZenohNetwork on Zenoh, CanNetwork on a CAN bus."""
 
     def __init__(self) -> None:
-        self.timing: LoopTiming | None = None
-        self.skipped = self.sent = 0
-        self.notes: list[str] = []
-        self.steps: int | None = None
+        self.timing: LoopTiming | None = None  # of the driver's loop; None in lockstep
+        self.skipped = self.sent = 0  # ticks of sessions that the driver missed, measurement frames, so far
+        self.notes: list[str] = []  # of the machine, for the status, such as real-time settings that it refused
+        self.steps: int | None = None  # that lockstep may still take; None for no limit
 
     @property
     @abstractmethod

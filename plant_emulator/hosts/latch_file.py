@@ -73,7 +73,7 @@ class LatchFile:
 
     @property
     def unkept(self) -> str | None:
-        """Why the newest latch is not on disk, in one line; None if it is."""
+        """Why the newest latch is not on disk; None if it is."""
         with self._changed:
             return None if self._wanted == self._kept else self._error or f"{self.path} is not written yet"
 

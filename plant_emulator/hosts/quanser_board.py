@@ -26,8 +26,7 @@ from aeroloop.protocol.wire.attitude import IDENTITY
 
 MOTORS: Final = np.array([0, 1], dtype=np.uint32)
 """Analog outputs that carry the voltages u2 and u3, and digital outputs that enable their amplifiers."""
-ENCODERS: Final = np.array([2, 3], dtype=np.uint32)
-"""Pitch and yaw; 0 and 1 are the rotors'."""
+ENCODERS: Final = np.array([2, 3], dtype=np.uint32)  # pitch and yaw; 0 and 1 are the rotors'
 GYRO: Final = np.array([3000, 3001, 3002], dtype=np.uint32)
 COUNTS: Final[Mapping[str, tuple[int, int]]] = {"quanser_aero2_usb": (2880, 4096), "quanser_aero_usb": (2048, 4096)}
 """Encoder counts a turn, pitch and yaw, by type of card; as in Quanser's own classes."""
@@ -44,8 +43,7 @@ class QuanserPlant(Plant):
     `passed` − 1 calls return at once and measure NaN. `failures` counts failed calls, reads without a sample and
     expiries of the watchdog.
 
-    Raises:
-        PlantError: The interface is missing, or the board cannot be opened, prepared or, at the first call, started.
+    Raises PlantError: the interface is missing, or the board cannot be opened or, at the first call, started.
     """
 
     actuators = 2
@@ -68,7 +66,7 @@ class QuanserPlant(Plant):
 
         counts = COUNTS[settings.card_type]
         sensing = SensorSettings(counts=counts, rate=settings.rate, bandwidth=settings.bandwidth)
-        self._sensors = Sensors(sensing, period, zeros=[0.5, 0.5])
+        self._sensors = Sensors(sensing, period, zeros=[0.5, 0.5])  # counts are whole: half a step off any edge
         self._steps = [sign * 2 * pi / turn for sign, turn in zip(settings.encoder_signs, counts, strict=True)]
         self._counts = np.zeros(2, dtype=np.int32)
         self._gyro = np.zeros(3) if settings.rate == "gyro" else None

@@ -102,8 +102,7 @@ class PlantTrace:
 
 # ── computing again ──
 
-_FIELDS: Final = ("session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
-"""Compared columns of a row; the first that differs is reported."""
+_COMPARED: Final = ("session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
 
 
 class PlantDifference(BaseModel, frozen=True):
@@ -212,7 +211,7 @@ class PlantReplay:
         row = plant_row(self._endpoint, measurement, None, 0)
         computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]
         self._ticks += 1
-        differ = [name for name in _FIELDS if logged[name].tobytes() != computed[name].tobytes()]
+        differ = [name for name in _COMPARED if logged[name].tobytes() != computed[name].tobytes()]
         self._differ += bool(differ)
         if differ and self._first is None:
             name, tick, session_tick = differ[0], int(logged["tick"]), int(logged["session_tick"])

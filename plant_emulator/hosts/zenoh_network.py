@@ -295,10 +295,9 @@ class ZenohNetwork(PlantNetwork):
             changed.set()
 
         def answer() -> Answer:
-            if (unkept := self._latch_file.unkept) is None:
-                return answers[0]
-            text = f"{answers[0].text}; but a restart of the plant would forget it: {unkept}"
-            return answers[0].model_copy(update={"text": text})
+            unkept = self._latch_file.unkept
+            more = f"; but a restart of the plant would forget it: {unkept}" if unkept else ""
+            return answers[0].model_copy(update={"text": answers[0].text + more})
 
         self._role.enqueue(apply)
         changed.wait(KEPT_S)

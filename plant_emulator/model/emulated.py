@@ -23,8 +23,7 @@ from aeroloop.protocol.wire.symbolic import Compiled
 
 Scalar = TypeVar("Scalar", float, "ca.SX")
 
-_BLOCK: Final = 4096
-"""Random numbers are drawn for this many periods at once: one draw costs more than a plant's step."""
+_BLOCK: Final = 4096  # periods whose random numbers are drawn at once: one draw costs more than a plant's step
 
 # ── rotors and friction ──
 
@@ -78,8 +77,7 @@ class FrictionSettings(BaseModel, extra="forbid"):
 def friction_torque(settings: FrictionSettings, rates: ca.SX) -> ca.SX:
     """Torque about each axis [N·m] from the rates about them [rad/s]. Shape (axes,).
 
-    The Coulomb torque changes sign smoothly, within a rate that the plant's sensors cannot resolve. Why: with a jump
-    the result would depend on where the integration steps fall.
+    The Coulomb torque changes sign smoothly: with a jump the result would depend on where the integration steps fall.
     """
     axes = rates.numel()
     viscous, coulomb = (ca.SX((*values, 0.0, 0.0, 0.0)[:axes]) for values in (settings.viscous, settings.coulomb))
@@ -136,8 +134,7 @@ def wind_torques(settings: WindSettings, axes: int, period: float) -> Iterator[l
 NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
 """Measurement without a valid value, such as of a state that is not finite."""
 
-DAMPING_RATIO: Final = 0.8
-"""ζ of the derivative's filter [1]; usual on the Aero, where Quanser's own examples have it."""
+DAMPING_RATIO: Final = 0.8  # ζ of the derivative's filter [1]; as in Quanser's own examples
 
 
 class SensorSettings(BaseModel, extra="forbid"):
@@ -265,8 +262,7 @@ def rate_of(pitch: Scalar, pitch_rate: Scalar, yaw_rate: Scalar) -> tuple[Scalar
 
 # ── one period ──
 
-SUBSTEPS: Final = 2
-"""Runge–Kutta steps a period. Two are off by 4e-9 rad/s at most in 2 ms, where Coulomb friction changes sign."""
+SUBSTEPS: Final = 2  # Runge–Kutta steps a period: off by 4e-9 rad/s at most, where Coulomb friction changes sign
 
 
 def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, period: float, substeps: int) -> ca.SX:

@@ -101,10 +101,10 @@ def missing(values: Sequence[float]) -> bool:
     [
         ("attitude", "it is written", "signal:kind[=value][@start[..end]]"),
         ("altitude:off", "no signal 'altitude'", "attitude, attitude.x"),
-        ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise and drop; attitude as a whole does"),
+        ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise, drop; attitude as a whole does"),
         ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
         ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
-        ("rate:bias=much", "'much' is not a number", ""),
+        ("rate:bias=much", "could not convert string to float: 'much'", ""),
         ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
         ("rate:off\n@1", "takes no 'off\\n'", "off, stuck"),
     ],
