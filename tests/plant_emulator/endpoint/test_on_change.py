@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
-from tests.support.plant_end import COUNTERS, OFF, RecordingPlant, claim_of, claimed, command, state_of, volts
+from tests.support.plant_end import COUNTERS, OFF, claim_of, claimed, command, state_of, volts
 from tests.support.simulated_link import wire_of
 
 HEARTBEAT = 15
@@ -107,20 +107,12 @@ def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_non
 # ── in real time, the end of silence may show late that values are valid again ──
 
 
-def after_a_failure() -> tuple[Endpoint, RecordingPlant, int]:
-    """An endpoint whose measurements had no valid value until tick 9."""
-    endpoint, plant = claimed(BOTH)
-    for k in range(1, 11):
-        plant.now = turning(nan if 5 <= k < 10 else 0.0)
-        endpoint.tick(invalid(k - 1) if 5 <= k - 1 < 10 else command(k - 1), k)
-    return endpoint, plant, 10
-
-
 def test_a_heartbeat_without_a_valid_value_is_forgiven_as_long_as_a_measurement_may_have_been_lost() -> None:
-    endpoint, plant, k = after_a_failure()
-    for later in range(HEARTBEAT):
-        endpoint.tick(invalid(k + later), k + later + 1)
+    endpoint, plant = claimed(BOTH)
+    for k in range(1, 11 + HEARTBEAT):
+        plant.now = turning(nan if 5 <= k < 10 else 0.0)
+        endpoint.tick(invalid(k - 1) if k > 5 else command(k - 1), k)
         assert state_of(endpoint) is PlantState.DRIVEN
-        assert plant.periods[-1] == OFF
-    endpoint.tick(invalid(k + HEARTBEAT), k + HEARTBEAT + 1)
+        assert plant.periods[-1] == (OFF if k > 5 else volts())
+    endpoint.tick(invalid(10 + HEARTBEAT), 11 + HEARTBEAT)
     assert endpoint.trip is TripCause.INVALID_COMMAND

@@ -101,10 +101,7 @@ def test_a_gyro_adds_its_noise_and_bias_to_the_true_rate() -> None:
     # independent samples: the mean is known to σ/√n, the deviation to σ/√(2n), a correlation to 1/√n
     assert errors.mean(axis=0) == pytest.approx(bias, abs=5 * noise / sqrt(n))
     assert errors.std(axis=0) == pytest.approx([noise] * 3, abs=5 * noise / sqrt(2 * n))
-    white = (errors - errors.mean(axis=0)) / noise
-    assert np.abs((white[1:] * white[:-1]).mean(axis=0)).max() < 5 / sqrt(n)
-    assert np.abs(np.corrcoef(white.T) - np.identity(3)).max() < 5 / sqrt(n)
-    assert np.abs((white * true).mean(axis=0)).max() < 5 / sqrt(n)
+    assert np.abs(np.corrcoef(errors.T) - np.identity(3)).max() < 5 / sqrt(n)
     for seed in (0, 1):  # it repeats with its seed, and only with it
         other = _sensors(attitude="perfect", rate="gyro", gyro_noise=noise, gyro_bias=bias, seed=seed)
         again = [other.read(IDENTITY, (x, y, z), []).rate for x, y, z in true[:5000].tolist()]  # more than one draw
