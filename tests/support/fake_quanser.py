@@ -1,9 +1,9 @@
 """Fake of `quanser.hardware`: a board with an emulated Aero, strict about every call.
 
 It follows Quanser's documentation: types and channels, the order of calls, overflows of a reader task's buffer, a
-watchdog that takes over the outputs and holds them. Where the documentation is silent it does the worst that a board
-might: a watchdog that has not expired refuses to be cleared, and clearing an expired one restores the outputs of before
-the expiry. A wrong use raises MisuseError, which no code treats as a failure of the board.
+watchdog that takes over the outputs. Where that is silent it does the worst that a board might: a watchdog that has not
+expired refuses to be cleared, and clearing an expired one restores the outputs of before. A wrong use raises
+MisuseError, which no code treats as a failure of the board.
 
 The board's time is a count of samples. With `realtime` samples fall due on an absolute grid, read or not; without,
 `task_read` lets the next period pass at once. `quanser_sdk/` beside this file is the package `quanser` with this board
@@ -30,6 +30,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 _ENCODERS: Final = range(4)
 _GYRO: Final = range(3000, 3003)
 
+EXPIRED: Final = "the watchdog has expired"
 Kind = Literal["analog", "digital"]
 
 _OUTPUTS: Final[dict[Kind, tuple[range, Any, Any, float, float]]] = {
@@ -132,7 +133,6 @@ class FakeQuanser:
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
-        """Let periods pass in which nobody reads."""
         for _ in range(periods):
             self.step()
 
@@ -154,7 +154,6 @@ class FakeQuanser:
         task.samples.append(self.sample(*task.channels))
 
     def wait(self) -> None:
-        """Let periods pass until there is a sample to read."""
         while self.task is None or not self.task.samples:
             ahead = self._due_ns() - time.monotonic_ns() if self.realtime else 0
             if ahead > 0:
@@ -234,7 +233,7 @@ class FakeQuanser:
         _array(values, dtype, n)
         within = all(low <= value <= high for value in values.tolist())  # false for NaN
         _require(within, f"{kind} outputs take {low:g} to {high:g}, not {values.tolist()}")
-        self._refuse_if_expired()
+        _refuse(self.expired, EXPIRED)
         unguarded = kind == "digital" and values.any() and self.watchdog is None
         _require(not unguarded, "an amplifier is switched on while no watchdog runs")
         for number, value in zip(numbers, values.tolist(), strict=True):
@@ -246,14 +245,14 @@ class FakeQuanser:
     def on_set_encoder_counts(self, channels: Any, n: int, counts: Any) -> None:
         numbers = _numbers(channels, n, _ENCODERS)
         _array(counts, np.int32, n)
-        self._refuse_if_expired()
+        _refuse(self.expired, EXPIRED)
         for channel, count in zip(numbers, counts.tolist(), strict=True):
             self.set_counts(channel, count)
 
     def on_read(self, *inputs_and_buffers: Any) -> None:
         numbers, buffers = _inputs(*inputs_and_buffers[:8]), inputs_and_buffers[8:]
         _check_buffers(*numbers, *buffers)
-        self._refuse_if_expired()
+        _refuse(self.expired, EXPIRED)
         _fill(self.sample(*numbers), *buffers)
 
     def on_task_create_reader(self, samples_in_buffer: int, *inputs: Any) -> object:
@@ -317,7 +316,7 @@ class FakeQuanser:
         _require(timeout > 0, f"a watchdog's timeout is positive, not {timeout}")
         _require(len(self.at_expiry) == 2, "the watchdog is started before its expiration states are set")
         _require(self.watchdog is None, "the watchdog is started twice")
-        self._refuse_if_expired()
+        _refuse(self.expired, EXPIRED)
         self.watchdog = ceil(timeout / self.period - 1e-9)
         self.reloaded = self.time
 
@@ -338,9 +337,6 @@ class FakeQuanser:
 
     def on_watchdog_stop(self) -> None:
         self.watchdog = None
-
-    def _refuse_if_expired(self) -> None:
-        _refuse(self.expired, "the watchdog has expired")
 
 
 # ── checks of arguments ──

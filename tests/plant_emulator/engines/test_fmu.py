@@ -174,13 +174,7 @@ def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(
     plant.close()
 
 
-@pytest.mark.parametrize(
-    ("changes", "line"),
-    [
-        ({"angles": ("a", "b", "c")}, "set either quaternion or angles"),
-        ({"voltages": ["u2", "u2"]}, "voltages must name each input once"),
-    ],
-)
-def test_settings_that_contradict_each_other_are_refused(changes: dict[str, Any], line: str) -> None:
-    with pytest.raises(ValidationError, match=line):
-        settings_of(Path("x.fmu"), **changes)
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    for changes, line in (({"angles": ("a", "b", "c")}, "quaternion or angles"), ({"voltages": ["u2"] * 2}, "once")):
+        with pytest.raises(ValidationError, match=line):
+            settings_of(Path("x.fmu"), **changes)

@@ -1,7 +1,4 @@
-"""Faults of a running emulator: one that is to come changes nothing, and each begin, end and frame is accounted for.
-
-Loops of an emulator's driver in simulated time; every measurement is answered at once.
-"""
+"""Faults of an emulator's loop in simulated time: one to come changes nothing, and each begin, end and frame counts."""
 
 from __future__ import annotations
 
@@ -15,7 +12,6 @@ from aeroloop.plant_emulator.endpoint.endpoint import Notice
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS
 from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import FaultStatus
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.plant_stage import Stage
@@ -42,10 +38,6 @@ class Run(Stage):
         super().__init__(loop, WIRE, plant, between=before, answer=lambda stage, frame: stage.command(frame, (1, -1)))
 
     @property
-    def statuses(self) -> list[FaultStatus]:
-        return self.endpoint.fault_statuses()
-
-    @property
     def events(self) -> list[Notice]:
         faults = [notice for notice in self.endpoint.notices if notice.kind == "fault"]
         return [notice for notice in faults if notice.text.startswith(("fault begins", "fault ends"))]
@@ -69,14 +61,14 @@ def test_faults_that_are_to_come_change_no_byte_and_leave_every_frame_as_it_arri
         for name in ("tick", "session_tick", "sent_as", "received_as", "outcome", "answered", "measurement", "command"):
             assert (run.column(name) == without.column(name)).all(), name
         assert (run.column("voltages") == without.column("voltages")).all()
-        assert {status.changed for status in run.statuses} == {0}
+        assert {status.changed for status in run.endpoint.fault_statuses()} == {0}
         assert run.events == []
 
 
 def test_configured_faults_count_from_the_claim_and_publish_begin_and_end_with_the_sessions_tick() -> None:
     run = Run("command:drop=1@0.1..0.14", "rate:bias=0.1@0.2").run(300)
     begin, later = CLAIMED_AT + 50, CLAIMED_AT + 100
-    found = [(status.begin_tick, status.end_tick, status.source) for status in run.statuses]
+    found = [(status.begin_tick, status.end_tick, status.source) for status in run.endpoint.fault_statuses()]
     assert found == [(begin, begin + 20, "configured"), (later, None, "configured")]
     assert [(notice.tick, notice.text) for notice in run.events] == [
         (begin - FIRST, "fault begins (configured): command:drop=1@0.1..0.14"),
@@ -101,5 +93,5 @@ def test_configured_faults_count_from_the_claim_and_publish_begin_and_end_with_t
 )
 def test_every_frame_sample_and_voltage_that_a_fault_changed_is_counted(fault: str, changed: int, effect: str) -> None:
     """Ten ticks at 500 Hz, while the loop runs."""
-    (status,) = Run(f"{fault}@0.1..0.12").run(150).statuses
+    (status,) = Run(f"{fault}@0.1..0.12").run(150).endpoint.fault_statuses()
     assert (status.changed, status.effect) == (changed, effect)

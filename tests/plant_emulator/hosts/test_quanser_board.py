@@ -69,7 +69,6 @@ def drive(plant: Plant, periods: int, voltages: tuple[float, float] = VOLTS) -> 
 
 
 def driven_plant(**changed: Any) -> tuple[QuanserPlant, FakeQuanser]:
-    """A plant that has been driven for long enough to be in motion."""
     plant, board = plant_on_board(**changed)
     drive(plant, 100)
     return plant, board
@@ -87,7 +86,6 @@ def expired_plant() -> tuple[QuanserPlant, FakeQuanser]:
 
 
 def emulated_aero(counts: tuple[int, int] = (2880, 4096)) -> EmulatedPlant:
-    """The same Aero without a board: an Aero 2's encoders unless given."""
     return AERO.model_copy(update={"sensors": SensorSettings(counts=counts)}).build(PERIOD)
 
 
@@ -103,14 +101,6 @@ def no_package() -> Iterator[None]:
         del sys.modules[name]
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
-    hand = FakeClock()
-    monkeypatch.setattr(quanser_board, "time", hand)
-    monkeypatch.setattr(fake_quanser, "time", hand)
-    return hand
-
-
 CLOSING = ["write_analog", "write_digital", "watchdog_stop", "task_stop", "task_delete", "close"]
 
 
@@ -122,19 +112,10 @@ def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_insta
 
 def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_begins() -> None:
     plant, board = plant_on_board(session=False)
-    assert list(board.calls) == [
-        "open",
-        "watchdog_stop",
-        "watchdog_clear",
-        "write_analog",
-        "write_digital",
-        "watchdog_set_analog_expiration_state",
-        "watchdog_set_digital_expiration_state",
-        "set_encoder_counts",
-        "read",
-        "task_create_reader",
-        "task_set_buffer_overflow_mode",
-    ]
+    assert " ".join(board.calls) == (
+        "open watchdog_stop watchdog_clear write_analog write_digital watchdog_set_analog_expiration_state "
+        "watchdog_set_digital_expiration_state set_encoder_counts read task_create_reader task_set_buffer_overflow_mode"
+    )
     assert (board.analog, board.enabled) == ([0.0, 0.0], [False, False])
     assert board.at_expiry == {"analog": [0.0, 0.0], "digital": [False, False]}
     assert board.task is not None
@@ -400,8 +381,11 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_cou
     assert (board.time, plant.passed) == (now + 1, 1)
 
 
-def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: FakeClock) -> None:
+def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """They return at once, and samples go on coming: those are not counted twice."""
+    clock = FakeClock()
+    for module in (quanser_board, fake_quanser):
+        monkeypatch.setattr(module, "time", clock)
     plant, board = plant_on_board(realtime=True)
     began = clock.now_ns
     plant.advance()

@@ -93,15 +93,13 @@ def test_viscous_friction_is_in_proportion_to_the_rate_and_coulomb_friction_cons
 # ── supply, start and end ──
 
 
-@pytest.mark.parametrize(("commanded", "held"), [((30.0, -1e9), (24.0, -24.0)), ((-24.5, 23.5), (-24.0, 23.5))])
-def test_voltages_are_clipped_to_the_supply(commanded: tuple[float, float], held: tuple[float, float]) -> None:
+def test_voltages_are_clipped_to_the_supply() -> None:
     plant, other = BARE.build(PERIOD), BARE.build(PERIOD)
-    plant.actuate(commanded)
-    other.actuate(held)
-    for _ in range(10):
-        plant.advance()
-        other.advance()
-    assert plant.truth().voltages == held
+    plant.actuate((30.0, -1e9))
+    other.actuate((24.0, -24.0))
+    for each in (plant, other):
+        each.advance()
+    assert plant.truth().voltages == (24.0, -24.0)
     assert plant.truth() == other.truth()
 
 
