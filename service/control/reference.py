@@ -30,17 +30,12 @@ Floats = NDArray[np.float64]
 POWERS: Final = 6
 SAMPLES: Final = 65
 """Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
-_CELLS: Final = {1: 512, 2: 96, 3: 36}
-"""Cells of each free phase to begin with, by the number of free phases."""
+_CELLS: Final = {1: 512, 2: 96, 3: 36}  # of each free phase to begin with, by the number of free phases
 _MOST_CELLS: Final = 100_000
-_TOLERANCE: Final = 1e-7
-"""A supremum over phases is at most this share above the largest value found, unless that takes too many cells."""
-_ROUNDED: Final = 1e-12
-"""A value's share by which it may be rounded."""
-_LIMIT_SLACK: Final = 1 + 1e-6
-"""So much may exceed a limit: a reference that just reaches it is within it."""
-_COMMON: Final = 16
-"""Axes are locked to each other if the ratio of their frequencies has integers up to this."""
+_TOLERANCE: Final = 1e-7  # share by which a supremum may exceed the largest value found, unless that takes more cells
+_ROUNDED: Final = 1e-12  # share by which a value may be rounded
+_LIMIT_SLACK: Final = 1 + 1e-6  # a reference that just reaches a limit is within it
+_COMMON: Final = 16  # axes are locked to each other if the ratio of their frequencies has integers up to this
 
 
 class FollowError(AeroloopError):
@@ -48,17 +43,11 @@ class FollowError(AeroloopError):
 
 
 class Limits(NamedTuple):
-    """Limits of a reference.
+    """Limits of a reference."""
 
-    Attributes:
-        rate: Largest angular velocity [rad/s].
-        tilt: Largest angle between the body's z axis and the vertical [rad].
-        rolls: Whether the vehicle can roll; a 2-DOF bench cannot.
-    """
-
-    rate: float
-    tilt: float
-    rolls: bool
+    rate: float  # largest angular velocity [rad/s]
+    tilt: float  # largest angle between the body's z axis and the vertical [rad]
+    rolls: bool  # whether the vehicle can roll; a 2-DOF bench cannot
 
 
 class Angles(NamedTuple):
@@ -83,24 +72,17 @@ class Angles(NamedTuple):
 
     def tilts(self) -> Floats:
         """Angles between the body's z axis and the vertical [rad]. Shape (n,)."""
-        tilts: Floats = np.arccos(np.clip(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1]), -1.0, 1.0))
+        tilts: Floats = np.arccos(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1]))
         return tilts
 
 
 class Trajectory(NamedTuple):
-    """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends.
+    """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends."""
 
-    Attributes:
-        starts: Start time of each [s], increasing. Shape (n,).
-        quintic: c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3).
-        amplitude: Of roll, pitch, yaw [rad]. Shape (n, 3).
-        frequency: Of roll, pitch, yaw [rad/s]. Shape (n, 3).
-    """
-
-    starts: Floats
-    quintic: Floats
-    amplitude: Floats
-    frequency: Floats
+    starts: Floats  # of each [s], increasing. Shape (n,)
+    quintic: Floats  # c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3)
+    amplitude: Floats  # of roll, pitch, yaw [rad]. Shape (n, 3)
+    frequency: Floats  # of roll, pitch, yaw [rad/s]. Shape (n, 3)
 
     @classmethod
     def of(cls, reference: Reference) -> Trajectory:
@@ -190,13 +172,12 @@ class Trajectory(NamedTuple):
     def largest(self, value: Callable[[Angles], Floats], terms: Floats) -> float:
         """The largest of a value of the angles: of the quintics' samples, and over all phases of the sinusoid.
 
-        Axes whose frequencies have a ratio of small integers are locked to each other. All others come, in the long
-        run, as near as one likes to every combination of phases; so a grid covers these, and each cell that may hold
-        the maximum is halved along each phase until the allowance for what lies between is small. It is derived: the
-        value is ‖v‖, v a sum of products of factors φ of one axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K.
-        Along the line from the maximum to the centre of its cell, up to d away in each phase, a product's second
-        derivative is at most (d Σn)² ΠK. As ‖v‖' = 0 at the maximum, the value at that centre is less by no more than
-        half the sum of these. `terms` has a row a product: its size ΠK, and Σn for the phases of roll, pitch and yaw.
+        Axes whose frequencies have a ratio of small integers are locked to each other; all others come as near as one
+        likes to every combination of phases. A grid covers these, and each cell that may hold the maximum is halved
+        until the allowance for what lies between is small: the value is ‖v‖, v a sum of products of factors φ of one
+        axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K. From the maximum to the centre of its cell, up to d away
+        in each phase, a product's second derivative is at most (d Σn)² ΠK, and ‖v‖' = 0 at the maximum. `terms` has a
+        row a product: its size ΠK, and Σn for the phases of roll, pitch and yaw.
         """
         most = float(value(self.samples()).max())
         sizes, degrees = terms[:, 0], terms[:, 1:]

@@ -26,21 +26,14 @@ class SessionLostError(AeroloopError):
 
 
 class ClaimClient:
-    """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it.
-
-    Attributes:
-        session: The granted session, or None.
-        last: Record of the vehicle's last session, from the last grant; None if the plant has none.
-        refusal: Why the plant refused the last claim; empty if it did not.
-        by_datagrams: Whether the last claim's frames travel as datagrams.
-    """
+    """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it."""
 
     def __init__(self, role: Node, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
         self._role, self._loop, self._wire, self._auto_arm = role, loop, wire, auto_arm
-        self.refusal = ""
-        self.session: str | None = None
-        self.last: SessionRecord | None = None
-        self.by_datagrams = False
+        self.refusal = ""  # why the plant refused the last claim; empty if it did not
+        self.session: str | None = None  # the granted one
+        self.last: SessionRecord | None = None  # of the vehicle's last session, from the last grant
+        self.by_datagrams = False  # whether the last claim's frames travel as datagrams
         self._kept: SessionRecord | None = None  # the last record that the plant has confirmed
 
     def claim(self) -> ZenohLink | None:

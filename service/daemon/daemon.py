@@ -26,17 +26,10 @@ CLAIM_PERIOD_S: Final = 0.25
 
 
 class Daemon:
-    """The controller end as a process. The role's name must be unique: the plant identifies its holder by it.
-
-    Raises:
-        LawError: The law cannot be used.
-        PluginError: There is no such law.
-    """
+    """The controller end as a process. Raises as `law_of`."""
 
     def __init__(self, role: Node, settings: Settings) -> None:
-        self._role = role
-        self._clock = role.clock
-        self._settings = settings
+        self._role, self._clock, self._settings = role, role.clock, settings
         self._next: Controller | None = self._new_controller()  # of the next session
         self._session: Session | None = None
         self._shared = Shared(role, settings, self._why_none)

@@ -1,9 +1,8 @@
-"""Operator changes: gains and reference of the running controller, and what sets them.
+"""Operator changes: gains and reference of the running controller, by request, by a stream, and at a session's start.
 
-That is an operator's request, a stream's set-point or the start of a session. A request is checked in a thread beside
-the loop, which takes time; what touches the controller runs in the loop, between two ticks. Every change is in the
-trace with the tick from which it holds, so that a log can be computed again. `controller.after_restart` decides what a
-session begins with; the plant gets a record of both, for the controller after this one.
+A request is checked in a thread beside the loop; what touches the controller runs in the loop, between two ticks. Every
+change is in the trace with the tick from which it holds, so that a log can be computed again. What a session begins
+with is decided by `controller.after_restart`; the plant gets a record, for the controller after this one.
 """
 
 from __future__ import annotations
@@ -41,7 +40,6 @@ from aeroloop.service.control.laws.registry import LawError, gains_of, with_gain
 from aeroloop.service.control.motion import (
     START_WITHIN_DEG,
     Approach,
-    nearest_turn,
     shortest,
     shortest_from_rest,
     to_set_point,
@@ -64,10 +62,9 @@ class OperatorChanges:
     """
 
     def __init__(self, role: Node, settings: Settings, trace: TraceWriter, why_none: Callable[[], str]) -> None:
-        law, own = settings.law, settings.controller
-        self._role, self._law, self._trace, self._why_none = role, law, trace, why_none
-        self._configured = reference = settings.reference
-        self._after_restart = own.after_restart
+        own, reference = settings.controller, settings.reference
+        self._role, self._law, self._trace, self._why_none = role, settings.law, trace, why_none
+        self._configured, self._after_restart = reference, own.after_restart
         rolls = settings.wire.actuators > 2
         self._limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=rolls)
         self.setpoints = SetpointStream(role)
@@ -79,7 +76,7 @@ class OperatorChanges:
         self.record = SessionRecord(
             controller=role.name,
             session=None,
-            gains=gains_of(law),
+            gains=gains_of(settings.law),
             gains_from="configured",
             reference=reference,
             reference_from="configured",
@@ -92,17 +89,14 @@ class OperatorChanges:
     # ── requests: checked in their topic's thread, applied between two ticks ──
 
     def serve(self) -> None:
-        """Serve `set_gains`, `track` and `show`. FollowError is the answer where one is refused."""
+        """Serve `set_gains`, `track` and `show`."""
         self._role.serve("set_gains", Gains, self._prepare_gains)
         self._role.serve("track", Track, self._prepare_track)
         self._role.serve("show", Request, lambda _: lambda: self.record)
 
     def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
         self._running()
-        try:
-            with_gains(self._law, gains)
-        except LawError as error:
-            raise FollowError(str(error)) from None
+        with_gains(self._law, gains)
         return lambda: self._set_gains(gains)
 
     def _prepare_track(self, track: Track) -> Callable[[], Answer]:
@@ -114,7 +108,6 @@ class OperatorChanges:
         return lambda: self._track(reference, trajectory, track.within_s, source)
 
     def _set_gains(self, gains: Gains) -> Answer:
-        """No event and no record if the gains change nothing."""
         controller = self._running()
         before = controller.gains
         controller.set_gains(gains)
@@ -128,7 +121,7 @@ class OperatorChanges:
     def _track(self, reference: Reference, trajectory: Trajectory, within_s: float | None, source: Source) -> Answer:
         """Follow a checked reference from this tick on, reached in `within_s` [s]; None: as soon as the limits allow.
 
-        Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
+        Coming to rest takes as long as braking does, whatever is given.
         """
         motion, held, t = self._running().motion, reference, self._time
         if isinstance(reference, Stream) or reference == Hold():
@@ -139,7 +132,8 @@ class OperatorChanges:
             approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
         self.setpoints.begin()
-        text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
+        words = in_words(reference if isinstance(reference, Stream) else held)
+        text = f"follows {words} within {approach.within_s:.4g} s"
         self._approach(held, trajectory, approach, text, reference, source)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
@@ -153,7 +147,7 @@ class OperatorChanges:
         if self._after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self.record.gains)
-        controller.motion.follow(Trajectory.of(self._present_reference), 0.0)
+        controller.motion.follow(Trajectory.of(self._present_reference), 0.0, Approach())
         self._started_near = False
         self.setpoints.discard()
         self._record_change(gains=self.record.gains, reference=self._present_reference)
@@ -214,8 +208,7 @@ class OperatorChanges:
                 return
             trajectory = Trajectory.of(target)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
-            approach = shortest_from_rest(trajectory, nearest_turn(start, trajectory), limits)
-            approach = approach.at_least(max(START_S, self.record.within_s))
+            approach = shortest_from_rest(trajectory, start, limits).at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
         self._approach(target, trajectory, approach, text, self.record.reference, self.record.reference_from)
 
@@ -236,10 +229,10 @@ class OperatorChanges:
         self._role.take_inbox()
 
     def _follow_stream(self, stream: Stream) -> None:
-        newest = self.setpoints.newest(stream, self._limits, self.record.session, self._k)
-        if newest is None:
+        hold = self.setpoints.newest(stream, self._limits, self.record.session, self._k)
+        if hold is None:
             return
-        hold, trajectory = newest
+        trajectory = Trajectory.of(hold)
         try:
             here = self._running().motion.here(self._time)
             approach = to_set_point(trajectory, here, stream.within_s, self._limits)
@@ -276,20 +269,6 @@ class OperatorChanges:
 
     def _update_record(self, **changed: Any) -> None:
         self.record = self.record.model_copy(update=changed)
-
-
-def _action_text(reference: Reference) -> str:
-    match reference:
-        case Hold(attitude=None):
-            return "comes to rest"
-        case Hold(attitude=(roll, pitch, yaw)):
-            return f"turns to roll {roll:g}°, pitch {pitch:g}°, yaw {yaw:g}°"
-        case Points(times=times):
-            return f"follows {len(times)} points over {times[-1]:g} s, from the first of them"
-        case Stream(timeout_s=timeout_s):
-            return f"follows what streams on `reference`, silent for {timeout_s:g} s at the most; at rest"
-        case _:
-            return f"follows a {reference.kind}, reached"
 
 
 def rest_of_reference(last: SessionRecord, period: float) -> Reference:
@@ -333,7 +312,7 @@ class SetpointStream:
         self.discard()
         self._last_s = self._role.clock.monotonic()
 
-    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> tuple[Hold, Trajectory] | None:
+    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> Hold | None:
         """The newest set-point received since the last tick that is not refused; silence of `timeout_s` is an event."""
         now, newest = self._role.clock.monotonic(), None
         for _ in range(SETPOINTS):
@@ -341,12 +320,11 @@ class SetpointStream:
                 break
             try:
                 hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
-                trajectory = Trajectory.of(hold)
-                trajectory.check(limits)
+                Trajectory.of(hold).check(limits)
             except (MessageError, FollowError) as error:
                 self.refuse(error, session)
             else:
-                newest = hold, trajectory
+                newest = hold
         if newest is not None:
             self._last_s = now
         elif self._last_s and now - self._last_s > stream.timeout_s:

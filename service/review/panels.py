@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.evaluation import initial_state
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Ticks, euler_deg
 from aeroloop.service.review.events import Truths

@@ -25,8 +25,8 @@ from aeroloop.service.control.motion import (
     Approach,
     Motion,
     approached,
+    at_rest,
     shortest,
-    shortest_from_rest,
     to_set_point,
 )
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
@@ -407,7 +407,7 @@ def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_
 def test_what_no_time_would_do_for_is_refused(start: tuple[float, float, float], target: Hold, why: str) -> None:
     limits = BODY._replace(tilt=radians(120))
     with pytest.raises(FollowError, match=why):
-        shortest_from_rest(Trajectory.of(target), start, limits).lasting(600.0, limits)
+        shortest(Trajectory.of(target), at_rest(start), limits).lasting(600.0, limits)
 
 
 # ── set-points of a stream ──

@@ -111,7 +111,7 @@ def test_without_a_session_there_is_nothing_to_change(loop: Loop) -> None:
 @pytest.mark.parametrize(
     ("reference", "ends_at", "words"),
     [
-        (yaw_of(30.0), yaw_of(30.0), "turns to roll 0°, pitch 0°, yaw 30°"),
+        (yaw_of(30.0), yaw_of(30.0), "follows roll, pitch, yaw 0°, 0°, 30°"),
         (THREE_POINTS, yaw_of(9.0), "follows 3 points over 2 s"),
     ],
 )

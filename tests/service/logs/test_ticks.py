@@ -13,8 +13,7 @@ import pytest
 from aeroloop.protocol.messages.models import Telemetry
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.laws.evaluation import initial_state
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay

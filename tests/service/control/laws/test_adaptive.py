@@ -16,7 +16,7 @@ import pytest
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, projection
-from aeroloop.service.control.laws.evaluation import law_function, received
+from aeroloop.service.control.laws.registry import law_function, received
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
 from tests.support.numpy_twin import Array

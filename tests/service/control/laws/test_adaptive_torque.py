@@ -13,9 +13,8 @@ import pytest
 from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
-from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.interface import LawSettings
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import configured_gains, initial_state, law_function, law_of
 from aeroloop.service.lab.experiment import run_experiment
 from tests.service.control.laws.test_baselines import BODY, unit
 from tests.support import numpy_twin as twin

@@ -16,8 +16,14 @@ from scipy.linalg import solve_discrete_are
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.config import load, load_over
 from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gain, response_of, tuned
-from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
+from aeroloop.service.control.laws.registry import (
+    CustomLawSettings,
+    configured_gains,
+    initial_state,
+    law_function,
+    law_of,
+    law_settings,
+)
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
