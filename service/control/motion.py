@@ -34,10 +34,8 @@ BRAKING: Final = 1.0
 START_WITHIN_DEG: Final = 20.0
 """A session that begins further than this from its reference first approaches it smoothly [deg]; from nearer the law
 gets there before a motor has been at its limit for the second after which the Aero trips."""
-LEAST_TURN_S: Final = 0.02
-"""Least time of the turn [s], however small it is."""
-LET_GO_S: Final = 0.1
-"""Least time in which an acceleration is reduced to 0 [s]: a jump would be a step of torque."""
+LEAST_TURN_S: Final = 0.02  # least time of the turn [s], however small it is
+LET_GO_S: Final = 0.1  # least time in which an acceleration is reduced to 0 [s]: a jump would be a step of torque
 _HARDER: Final = 6  # how often the time of a braking is halved at the most
 _SLOWER, _TRIES = 1.05, 8  # of a quintic to a set-point
 _SLACK: Final = 1 + 1e-9  # rounding of what is compared with a limit

@@ -37,21 +37,12 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector, distance, to_eul
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
-from aeroloop.service.control.motion import (
-    START_WITHIN_DEG,
-    Approach,
-    shortest,
-    shortest_from_rest,
-    to_set_point,
-)
+from aeroloop.service.control.motion import START_WITHIN_DEG, Approach, shortest, shortest_from_rest, to_set_point
 from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 
-START_S: Final = 1.0
-"""Least time to reach a reference that no operator gave a time for, at a session's start [s]."""
-SETPOINTS: Final = 4
-"""Set-points of a stream that are read before a tick; of more, the newest."""
-_DECIMALS: Final = 3
-"""Of an attitude found [deg]: far finer than any level, and short to print."""
+START_S: Final = 1.0  # least time to reach a reference that no operator gave a time for, at a session's start [s]
+SETPOINTS: Final = 4  # set-points of a stream that are read before a tick; of more, the newest
+_DECIMALS: Final = 3  # of an attitude found [deg]: far finer than any level, and short to print
 
 
 class OperatorChanges:

@@ -37,23 +37,16 @@ from aeroloop.service.daemon.tick_source import PlantTick, TickSource
 
 LOCKSTEP_PATIENCE_S: Final = 2.0
 """Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
-WAIT_S: Final = 0.02
-"""How often the session is checked while nothing is received [s]."""
-READ_S: Final = 0.01
-"""Least time between two readings of the plant's status [s]."""
-STALL_TICKS: Final = 10
-"""Ticks missed in a row that cause a warning."""
-TELEMETRY_HZ: Final = 10.0
-"""Telemetry is for people: the trace has every tick [Hz]."""
+WAIT_S: Final = 0.02  # how often the session is checked while nothing is received [s]
+READ_S: Final = 0.01  # least time between two readings of the plant's status [s]
+STALL_TICKS: Final = 10  # ticks missed in a row that cause a warning
+TELEMETRY_HZ: Final = 10.0  # telemetry is for people: the trace has every tick [Hz]
 LAW_TIMEOUT_S: Final = 0.1
 """A tick of the law that takes longer faults the controller, except in lockstep [s]. By then the plant's watchdog, with
 its default time, has set 0 V."""
-REPORT_S: Final = 1.0
-"""A tick that lasts longer is reported while it lasts [s]."""
-STOP_S: Final = 2.0
-"""How long a hanging tick may outlast a request to stop [s]."""
-CHECK_S: Final = 0.1
-"""How often a law in Python is checked [s]."""
+REPORT_S: Final = 1.0  # a tick that lasts longer is reported while it lasts [s]
+STOP_S: Final = 2.0  # how long a hanging tick may outlast a request to stop [s]
+CHECK_S: Final = 0.1  # how often a law in Python is checked [s]
 
 
 class Shared:

@@ -21,8 +21,7 @@ from aeroloop.protocol.wire.transmit import UNCHANGED
 MAILBOX: Final = 16
 """Frames that may wait where silence is allowed: a displaced frame could not be classified as late."""
 
-PATIENCE: Final = 0.5
-"""Share of a period by which a frame may be later than the fastest before its tick is silent."""
+PATIENCE: Final = 0.5  # share of a period by which a frame may be later than the fastest before its tick is silent
 
 
 class PlantTick(NamedTuple):

@@ -23,8 +23,7 @@ DASHES: Final = ("solid", "7px,2px", "2px,2px", "9px,2px,2px,2px", "14px,3px", "
 INK, QUIET, GRID, BAND, GRAVE, MARK = "#1a1e24", "#58616d", "#eceff2", "#8a6d00", "#b03a00", "#8b95a3"
 MEASURED, DESIRED, TRUE = "#0072b2", "#d55e00", "#009e73"
 
-WIDE: Final = 30.0
-"""Durations that differ by more than this factor have a logarithmic axis."""
+WIDE: Final = 30.0  # durations that differ by more than this factor have a logarithmic axis
 
 Json = dict[str, Any]
 

@@ -18,15 +18,13 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from aeroloop.service.logs.outputs import OutputError
 
-WIDTH_IN: Final[dict[int, float]] = {1: 3.5, 2: 7.16}
-"""Width of one column, and of two, in IEEE's journals [in]."""
+WIDTH_IN: Final[dict[int, float]] = {1: 3.5, 2: 7.16}  # width of one column, and of two, in IEEE's journals [in]
 
 FORMATS: Final[dict[str, dict[str, Any]]] = {
     "pdf": {"metadata": {"CreationDate": None}},
     "svg": {"metadata": {"Date": None}},
     "png": {"dpi": 600},
-}
-"""Suffixes of every figure, with the options of each."""
+}  # suffixes of every figure, with the options of each
 
 BLUE, ORANGE, GREEN, PURPLE, BLACK = "#0072b2", "#d55e00", "#009e73", "#b0568c", "#222222"
 

@@ -50,8 +50,7 @@ UNMET: Final = {
     "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
     "C.30": "the command is saturated or missing, against (C.30)",
     "Assumption 3": "the attitude error is larger than the certificate assumes",
-}
-"""Premises of Lemma 1 that a true state may not satisfy, and what that means."""
+}  # premises of Lemma 1 that a true state may not satisfy, and what that means
 
 
 def figure_rows(runs: Sequence[Figures]) -> list[Row]:

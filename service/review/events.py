@@ -1,14 +1,13 @@
 """Events of a session: published events, changes, recorder losses, faults of the plant, and what statuses say.
 
 An event is shown at its sender's time, wherever it stands in the file: with a session tick at that tick, any other by
-its time of publication on the session's clock, as the sender's own trace relates the two. For a sender without a
-trace, such as a recorder, the plant's trace does, for showing only.
+its time of publication, which the sender's own trace relates to ticks; for one without a trace the plant's does.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import inf, isfinite
 from operator import itemgetter
 from typing import Final, NamedTuple
@@ -22,8 +21,7 @@ from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, TrueStates
 from aeroloop.service.review.report import FaultInterval, Mark
 
-MAX_MARKS: Final = 300
-"""Marks of a kind and role; one more stands for the rest."""
+MAX_MARKS: Final = 300  # marks of a kind and role; one more stands for the rest
 
 _MODELS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
@@ -80,25 +78,19 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
     return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
 
 
-class Happened(NamedTuple):
-    """What happened: marks in order of time, reasons of trips of the vehicle, messages that were lost by topic."""
+def happened(
+    messages: Messages, session: Session, span: tuple[int, int], alone: bool
+) -> tuple[list[Mark], list[str], dict[str, int]]:
+    """Marks in order of time, reasons of the vehicle's trips, and messages that the recorder lost, by topic.
 
-    marks: list[Mark]
-    trips: list[str]
-    losses: dict[str, int]
-
-
-def happened(messages: Messages, session: Session, span: tuple[int, int], alone: bool) -> Happened:
-    """What happened to the vehicle of a session; if `alone`, without the trips of its other sessions.
-
-    Marks outside of the `span` from the first to the last tick have no time.
+    If `alone`, without the trips of other sessions. Marks outside of the `span`, the first and last tick, have no time.
     """
     found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
     trips, losses = list[str](), Counter[str]()
     (first, last), latest = span, max(session.extent.last.values())
-    clocks, period = _Clocks(session), session.settings.loop.period
+    tick_at, period = _clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
-        tick = shown = clocks.tick(role, at_ns)
+        tick = shown = tick_at(role, at_ns)
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
             if message.kind == "changed" and role == "controller" and of_session:
@@ -127,7 +119,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
             outside = -1 if shown < first else 1 if shown > last + 1 else 0
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
-    return Happened([mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses))
+    return [mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses)
 
 
 def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
@@ -161,15 +153,11 @@ def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]
             continue
         begin, end = max(0, one.begin_tick - first), inf if one.end_tick is None else one.end_tick - first
         if begin < min(ticks, end):
-            interval = FaultInterval(
-                fault=one.fault,
-                source=one.source,
-                begin_s=round(begin * period, 9),
+            found.append(FaultInterval(
+                fault=one.fault, source=one.source, effect=one.effect, begin_s=round(begin * period, 9),
                 end_s=None if end >= ticks else round(end * period, 9),
                 changed=one.changed - changed.get((one.fault, one.source, one.begin_tick), 0),
-                effect=one.effect,
-            )
-            found.append(interval)
+            ))  # fmt: skip
     return sorted(found, key=lambda interval: interval.begin_s)
 
 
@@ -183,29 +171,25 @@ def described(change: Change) -> str:
     return "; ".join(parts)
 
 
-class _Clocks:
-    """Relation of each end's wall clock to the ticks, by its rows of the session."""
+def _clocks(session: Session) -> Callable[[str, int], float]:
+    """The session's tick at a time on a role's wall clock, by its rows; negative before it, ∞ without any row."""
+    known = dict[str, tuple[int, Array, Array]]()
+    ends = ("controller", session.controller, session.at_controller), ("plant", session.plant, session.at_plant)
+    for end, rows, at in ends:
+        time = np.maximum(rows["received"], rows["sent"])
+        its, ticks = at[at >= 0], session.k[at >= 0]
+        its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
+        if len(its):
+            walls = (time + rows["wall"])[its]
+            order, first = np.argsort(walls, kind="stable"), int(walls.min())
+            known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
 
-    def __init__(self, session: Session) -> None:
-        self._period_ns = session.settings.loop.period * 1e9
-        self._known: dict[str, tuple[int, Array, Array]] = {}
-        for end, rows, at in (
-            ("controller", session.controller, session.at_controller),
-            ("plant", session.plant, session.at_plant),
-        ):
-            time = np.maximum(rows["received"], rows["sent"])
-            its, ticks = at[at >= 0], session.k[at >= 0]
-            its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
-            if len(its):
-                walls = (time + rows["wall"])[its]
-                order, first = np.argsort(walls, kind="stable"), int(walls.min())
-                self._known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
-
-    def tick(self, role: str, at_ns: int) -> float:
-        """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
-        clock = self._known.get(role) or self._known.get("plant") or self._known.get("controller")
+    def tick(role: str, at_ns: int) -> float:
+        clock = known.get(role) or known.get("plant") or known.get("controller")
         if clock is None:
             return inf
         first, walls, ticks = clock
         within = min(max(at_ns - first, 0), int(walls[-1]))
-        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / self._period_ns
+        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / (session.settings.loop.period * 1e9)
+
+    return tick

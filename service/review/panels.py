@@ -24,19 +24,16 @@ from aeroloop.service.review.theorem import TheoremCheck
 MAX_POINTS: Final = 180_000
 """Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
 
-DESIRED: Final = ("desired", "bound")
-"""Beginnings of the names of lines that a run should follow, or stay below."""
+DESIRED: Final = ("desired", "bound")  # beginnings of the names of lines that a run should follow, or stay below
 
 CASES: Final = {"continuous": "without quantization", "quantized": "with quantization", "wind": "with wind"}
 NUMBERS: Final[dict[str, dict[str, str]]] = {
     "continuous": {"error": "C.4", "rate_error": "C.5", "input": "C.6"},
     "quantized": {"attitude": "C.7", "rate": "C.8", "error": "C.9", "rate_error": "C.10", "input": "C.11"},
     "wind": {"error": "C.12", "rate_error": "C.13", "input": "C.14"},
-}
-"""Number of the paper's figure of a quantity, by case."""
+}  # number of the paper's figure of a quantity, by case
 
-NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))
-"""Of a log without true states."""
+NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))  # of a log without true states
 
 _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
 """Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""

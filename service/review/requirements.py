@@ -90,11 +90,9 @@ LIMITED: Final = {
 }  # fmt: skip
 """Figures that can have a limit, by their paths in `--json`, and the limit's unit."""
 
-AT_LEAST: Final = ("theorem.held",)
-"""Figures of which more is better."""
+AT_LEAST: Final = ("theorem.held",)  # figures of which more is better
 
-UNSEEN_SHOWN: Final = 3
-"""Of what a figure does not see, so many are listed in its line."""
+UNSEEN_SHOWN: Final = 3  # of what a figure does not see, so many are listed in its line
 
 
 class LimitError(AeroloopError):

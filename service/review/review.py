@@ -13,6 +13,8 @@ from math import inf, isnan
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import BaseModel, Field
+
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError, Settings
@@ -23,7 +25,7 @@ from aeroloop.service.logs.ticks import Ticks, recompute
 from aeroloop.service.review.events import Messages, Truths, age_us, fault_intervals, happened, read_messages
 from aeroloop.service.review.observations import gaps, lapses, saturation, timing
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
-from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, flat
+from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, differences, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
@@ -99,7 +101,8 @@ def read(
         unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
     messages = read_messages(recording, which, settings.wire.actuators)
     recording.release()
-    events, faults = happened(messages, its, span, session is not None), fault_intervals(messages, its)
+    marks, trips, losses = happened(messages, its, span, session is not None)
+    faults = fault_intervals(messages, its)
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     ticks, went = judged.ticks, lapses(its, judged.missed)
     its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
@@ -125,7 +128,7 @@ def read(
         unsent=judged.unsent,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         log=recording.name,
-        trips=events.trips,
+        trips=trips,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
         damages=[*recording.unread, *(f"malformed: {n} of {topic}" for topic, n in sorted(messages.malformed.items()))],
     )
@@ -155,14 +158,14 @@ def read(
         gap_count=gap_count,
         saturated=saturated,
         invalid=invalid,
-        losses=events.losses,
+        losses=losses,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
         missing=missing,
         unknown=its.unknown,
         unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
         lapses=went,
         theorem=theorem.findings,
-        marks=events.marks,
+        marks=marks,
         faults=faults,
     )
     path = paths[0].resolve()
@@ -201,3 +204,45 @@ def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
         if key.startswith(("loop.", "wire.", "plant.")) and not key.startswith(OWN_AFFAIRS)
         if controller.get(key) != plant.get(key)
     ]
+
+
+# ── several runs side by side ──
+
+
+class SettingDifference(BaseModel, frozen=True):
+    """A dotted key of the configuration whose value is not the same in every run; null where a run has no such key."""
+
+    key: str
+    values: dict[str, Any] = Field(description="by run")
+
+
+class Comparison(BaseModel, frozen=True):
+    """Runs by their names, which differ, and what differs in their configurations (`log compare --json`)."""
+
+    runs: dict[str, Findings]
+    differences: list[SettingDifference]
+
+    @classmethod
+    def of(cls, reports: Sequence[Report]) -> Comparison:
+        """Comparison of runs whose names differ."""
+        runs = {run.name: run.findings for run in reports}
+        rows = [(key, dict(zip(runs, values, strict=True))) for key, values in differences(reports)]
+        return cls(runs=runs, differences=[SettingDifference(key=key, values=values) for key, values in rows])
+
+
+def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
+    """A report of every log or folder, each a run of its own, checked against limits. Raises as `read` does.
+
+    Logs of one name are named with their folders, and if that is not enough, by number.
+    """
+
+    def share(done: int) -> Progress | None:
+        return None if progress is None else lambda part: progress((done + part) / len(logs))
+
+    points = MAX_POINTS // len(logs)  # one page holds them all
+    runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
+    alike, names = [run.name for run in runs], list[str]()
+    for name, log in zip(alike, logs, strict=True):
+        long = name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"
+        names.append(long if long not in names else f"{long} ({sum(one.startswith(long) for one in names) + 1})")
+    return [replace(run, name=name) for run, name in zip(runs, names, strict=True)]

@@ -10,15 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import (
-    Event,
-    Loss,
-    Percentiles,
-    Status,
-    Telemetry,
-    Timing,
-    Truth,
-)
+from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status, Telemetry, Timing, Truth
 from aeroloop.protocol.messages.operator import Setpoint
 from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.protocol.messages.trace import Received as ReceivedAs

@@ -112,11 +112,7 @@ class LonelyNode(Node):
 class Loop:
     """What the daemon does around OperatorChanges; `log` has each session's ticks, measurements and commands."""
 
-    def __init__(
-        self,
-        reference: Reference,
-        settings: ControllerSettings = CONFIGURED,
-    ) -> None:
+    def __init__(self, reference: Reference, settings: ControllerSettings = CONFIGURED) -> None:
         self.clock = FakeClock()
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()

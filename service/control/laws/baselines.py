@@ -47,8 +47,7 @@ from aeroloop.service.control.laws.interface import (
 
 # ── one tuning rule ──
 
-VOLTAGE_LIMIT: Final = 24.0
-"""Largest voltage of the Aero's supply [V]."""
+VOLTAGE_LIMIT: Final = 24.0  # largest voltage of the Aero's supply [V]
 TUNED: Final = ("pd", "pid", "adaptive-torque", "sliding", "lqr")
 """Kinds that the tuning rule has settings for. The law without adaptation has the paper's own gains."""
 

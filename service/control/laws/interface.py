@@ -29,8 +29,7 @@ Gains3 = tuple[Gain, Gain, Gain]  # one for each body axis: x, y, z
 PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
 MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
 """The same of a gain that must act: the diagonal of a positive definite matrix."""
-Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-"""The diagonal of a positive definite matrix."""
+Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]  # the diagonal of a positive definite matrix
 _Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
 
 
@@ -96,8 +95,7 @@ class Law(ABC, Generic[T]):
     constructor raises ValueError if it is no law for so many actuators.
     """
 
-    Settings: ClassVar[type[LawSettings]]
-    """The model of its settings."""
+    Settings: ClassVar[type[LawSettings]]  # the model of its settings
     gains: ClassVar[tuple[str, ...]] = ()
     """Names of those settings that may change while it runs: numbers, or tuples of them."""
     units: ClassVar[Mapping[str, str]] = {}

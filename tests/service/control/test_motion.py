@@ -20,15 +20,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
-from aeroloop.service.control.motion import (
-    LEAST_TURN_S,
-    Approach,
-    Motion,
-    approached,
-    at_rest,
-    shortest,
-    to_set_point,
-)
+from aeroloop.service.control.motion import LEAST_TURN_S, Approach, Motion, approached, at_rest, shortest, to_set_point
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
 from tests.support.numpy_twin import Array, Sinusoids
 

@@ -16,8 +16,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.compare import Comparison, read_runs
-from aeroloop.service.review.review import read, review
+from aeroloop.service.review.review import Comparison, read, read_runs, review
 from tests.support.edited_log import message_of, rewrite
 from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, make_log, write
 
