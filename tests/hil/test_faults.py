@@ -10,7 +10,6 @@ import os
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -159,34 +158,21 @@ def test_frames_of_a_wrong_length_displace_no_good_one_and_are_counted(hil: Hil)
 # ── faults of frames, sensors and motors, in lockstep: their bounds are tested in tests/service/test_faults.py ──
 
 
-RIDDEN_OUT: list[str] = []
-WATCHDOG = ["no fresh command for 100 ms: 0 V"]
-ON_CHANGE = {"wire.transmit": "on_change"}
-
-
 @pytest.mark.parametrize(
-    ("settings", "faults", "trips"),
+    ("faults", "trips"),
     [
-        ({}, ["command:drop=0.2", "command:duplicate=0.2"], RIDDEN_OUT),  # 50 in a row are not lost by chance: 0.2⁵⁰
-        ({}, ["command:reorder=0.1"], RIDDEN_OUT),
-        ({}, ["measurement:drop=0.2"], RIDDEN_OUT),
-        (ON_CHANGE, ["measurement:drop=0.1", "command:drop=0.1", "command:garble=0.02"], RIDDEN_OUT),
-        ({}, ["command:off@1"], WATCHDOG),
-        ({}, ["command:stuck@1"], WATCHDOG),  # a stuck sender proves nothing about whether it still sees the plant
+        (["command:drop=0.2", "command:duplicate=0.2"], []),  # 50 in a row are not lost by chance: 0.2⁵⁰
+        (["command:stuck@1"], ["no fresh command for 100 ms: 0 V"]),  # it does not show that it still sees the plant
     ],
 )
-def test_lost_repeated_and_overtaking_frames_are_ridden_out_and_a_stream_that_ends_trips_the_watchdog(
-    tmp_path: Path, settings: dict[str, Any], faults: list[str], trips: list[str]
+def test_lost_frames_are_ridden_out_and_a_stream_that_ends_trips_the_watchdog(
+    tmp_path: Path, faults: list[str], trips: list[str]
 ) -> None:
     with Hil(tmp_path, lockstep=True) as hil:
-        hil.start(settings={"plant.faults": faults, **settings})
+        hil.start(settings={"plant.faults": faults})
         hil.run(3)
-        log = hil.log
-    assert log.trips == trips
-    if trips == RIDDEN_OUT:
-        assert log.figures.duration_s > 2.9
-        # 7.2e-4 without faults: the start's error, which no command can mend sooner. A fifth lost adds little.
-        assert log.figures.z_track < 8e-4
+        assert hil.log.trips == trips
+        assert trips or hil.log.figures.z_track < 8e-4  # 7.2e-4 without faults: the start's error
 
 
 def test_faults_do_over_the_network_what_they_do_in_one_process(tmp_path: Path) -> None:

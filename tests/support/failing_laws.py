@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
@@ -21,7 +20,7 @@ Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape"]
 class FailingSettings(LawSettings):
     """What shall go wrong."""
 
-    failure: Failure = Field(default="raises", description="what goes wrong")
+    failure: Failure | Literal["hangs"] = Field(default="raises", description="what goes wrong")
     at: int = Field(default=3, description="at which tick")
 
 
@@ -48,6 +47,9 @@ class Failing(PythonLaw[FailingSettings]):
                 return [1.0]
             case "another shape":
                 self.state["ticks"] = np.zeros(2)
+            case "hangs":
+                while True:
+                    pass
         return [1.0] * self.actuators
 
 
@@ -100,39 +102,6 @@ class Runaway(ExpressionLaw[LawSettings]):
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
-
-
-class FourthTick(PythonLaw[LawSettings]):
-    """Gives 1 V, and calls `fail` at its fourth tick and every later one."""
-
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
-
-    def step(self, now: Now[Any]) -> Any:
-        self.state["ticks"] = now.state["ticks"] + 1
-        if now.state["ticks"] > 2:
-            self.fail()
-        return [1.0] * self.actuators
-
-    @abstractmethod
-    def fail(self) -> None: ...
-
-
-class Raising(FourthTick):
-    """Fails."""
-
-    def fail(self) -> None:
-        raise ZeroDivisionError("by nothing")
-
-
-class Hanging(FourthTick):
-    """Never ends."""
-
-    def fail(self) -> None:
-        while True:
-            pass
 
 
 class NoLaw:

@@ -305,18 +305,6 @@ def test_no_axis_goes_further_beyond_its_start_or_its_target_than_it_takes_to_st
 
 
 @settings(max_examples=40)
-@given(start=any_states(), reference=allowed)
-def test_braking_and_run_up_stay_within_the_limit_of_acceleration_or_the_one_that_they_find(
-    start: Angles, reference: Reference
-) -> None:
-    target = Trajectory.of(reference)
-    approach = shortest(target, start, NO_LIMITS).at_least(1e6)  # nothing to brake harder for, and no turn to speak of
-    accelerations = way(approached(target, start, 0.0, approach), target, approach.within_s).acceleration
-    most = np.maximum(1.0, np.maximum(np.abs(start.acceleration[0]), np.abs(target.first.acceleration[0])))
-    assert np.all(np.abs(accelerations) <= most * (1 + 1e-6))  # 1e6 s round to 1e-10 s
-
-
-@settings(max_examples=40)
 @given(history=histories, reference=allowed, longer_s=seconds(0, 60))
 def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
     history: list[tuple[Reference, float, float]], reference: Reference, longer_s: float
@@ -405,22 +393,6 @@ def test_what_no_time_would_do_for_is_refused(start: tuple[float, float, float],
 # ── set-points of a stream ──
 
 
-@settings(max_examples=40)
-@given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
-def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
-    start: Hold, target: Hold, asked_s: float, rate: float
-) -> None:
-    trajectory, limits = Trajectory.of(target), NO_LIMITS._replace(rate=rate)
-    begin = Trajectory.of(start).first
-    approach = to_set_point(trajectory, begin, asked_s, limits)
-    assert approach.brake_s is None  # a single quintic
-    asked = approached(trajectory, begin, 0.0, Approach(asked_s)).fastest()
-    # Rates fall as the time grows: the least is asked_s · asked / rate, and 5 % more is what is taken at once.
-    needed_s = asked_s if asked <= rate else asked_s * asked / rate * 1.05
-    assert approach.within_s == pytest.approx(needed_s, rel=1e-9)
-    assert approached(trajectory, begin, 0.0, approach).fastest() <= rate
-
-
 @settings(max_examples=50)
 @given(start=any_states(), target=turns.map(lambda a: Hold(attitude=a)), asked_s=seconds(0.02, 2.0))
 def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hold, asked_s: float) -> None:
@@ -473,15 +445,3 @@ def test_what_stays_within_the_limits_is_not_refused() -> None:
     for reference in (Sinusoid(), Hold(attitude=(0.0, 59.9, 7200.0)), Stream(), steep):
         Trajectory.of(reference).check(BENCH)
     Trajectory.of(ROLLS).check(BODY)
-
-
-def test_a_sinusoid_that_is_too_fast_only_after_many_periods_is_refused() -> None:
-    """Nearly equal frequencies: roll and yaw oppose each other at the steepest pitch within an hour, not before."""
-    trajectory = Trajectory.of(Sinusoid(amplitude=(60.0, 50.0, 80.0), frequency=(0.4, 0.4006, 0.4002)))
-    first, hour = (
-        Angles(*(part[0] for part in trajectory.at(np.arange(0, until_s, 0.05)[None]))).speeds().max()
-        for until_s in (8 * 2 * pi / 0.4, 3600)
-    )
-    assert first < 0.86 < hour <= trajectory.fastest() < 1.03 * hour
-    with pytest.raises(FollowError, match="max_reference_rate"):
-        trajectory.check(BODY._replace(tilt=pi, rate=0.86))

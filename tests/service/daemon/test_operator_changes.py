@@ -220,15 +220,6 @@ def test_silence_is_reported_once_and_the_last_set_point_held_until_there_is_ano
         assert streaming.yaw() == pytest.approx(yaw, abs=1e-12)
 
 
-def test_set_points_without_a_stream_reference_are_ignored(loop: Loop) -> None:
-    loop.stream(5.0)
-    loop.raw(b"junk")
-    loop.clock.advance(5.0)
-    loop.run(0.3)
-    assert (loop.live.setpoints.refused, loop.yaw(), len(loop.changes())) == (0, 0.0, 1)
-    assert loop.events("lost") == loop.events("fault") == []
-
-
 def test_a_stream_is_over_once_something_else_is_tracked_and_moves_no_later_stream(streaming: Loop) -> None:
     streaming.stream(9.0)
     streaming.ask("track", Track(reference=Hold(attitude=(0.0, 0.0, 4.0)), within_s=0.2))  # between the same two ticks

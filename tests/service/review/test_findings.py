@@ -230,16 +230,3 @@ def test_what_is_no_limit_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(LimitError) as refused:
         Limit.parse(text)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_the_account_lists_trips_before_figures_and_what_does_not_hold(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
-    more = [event(0.41, "plant", "tripped", "the [red] limit")]
-    path = rewrite(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
-    assert execute(["log", "review", str(path), "--require", "gap_count=0"]) == 1
-    out = " ".join(capsys.readouterr().out.split())
-    assert out.index("0.410 s plant tripped the [red] limit") < out.index(" z_track ")
-    assert "gaps 1, the longest 3 ticks at 0.100 s" in out
-    assert "✗ gap_count ≤ 0 1" in out

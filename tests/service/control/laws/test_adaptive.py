@@ -6,17 +6,14 @@ equal numbers.
 
 from __future__ import annotations
 
-from array import array
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
-from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, projection
-from aeroloop.service.control.laws.registry import law_function, received
+from aeroloop.service.control.laws.registry import law_function
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
 from tests.support.numpy_twin import Array
@@ -201,20 +198,3 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
         # scaling to a length of k_θ/0.95 rounds in the last place
         assert np.linalg.norm(theta - first) <= p.damping_bound / 0.95 * (1 + 1e-14)
     assert pressed > 300
-
-
-def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:
-    """Whether the last pointed away, along, or at a right angle, or ε was longer than 1, or −0."""
-    corners = [0.0, -0.0, 0.6, -0.6, 0.8, -0.8, 1.0, -1.0, 1.3, 1e200]
-    rng = np.random.default_rng(0)
-    given = ca.SX.sym("eps", 3), ca.SX.sym("last", 4)
-    step = Compiled(ca.Function("attitude", [*given], [received(*given)], ["eps", "last"], ["q"]))
-    last, eps, q = step.inputs["last"], step.inputs["eps"], step.outputs["q"]
-    starts: list[Quaternion] = [IDENTITY, (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.6, -0.8)]
-    for before in starts:
-        now = before
-        for x, y, z in rng.choice(corners, size=(2000, 3), p=[0.25, 0.05, *[0.1] * 6, 0.05, 0.05]).tolist():
-            last[:], eps[:] = memoryview(array("d", now)), memoryview(array("d", (x, y, z)))
-            step()
-            now = received_quaternion(x, y, z, now)
-            assert q.tobytes() == array("d", now).tobytes()

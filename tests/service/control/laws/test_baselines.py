@@ -150,39 +150,6 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
         assert np.poly(A) == pytest.approx(np.poly(expected), rel=3 * wn * PERIOD if kind == "lqr" else 1e-4)
 
 
-@pytest.mark.parametrize("kind", ["pd", "sliding"])
-def test_far_from_the_reference_the_error_moves_as_the_law_promises(kind: str) -> None:
-    """V of PD falls by the damping alone; the sliding law moves straight to its surface."""
-    rng = np.random.default_rng(2)
-    body = Body(kind, rng, **({"kp": (1.3, 1.3, 1.3), "kd": (0.5, 0.9, 0.7)} if kind == "pd" else {}))
-    for _ in range(5):
-        q, q_d, omega, omega_d, omega_d_dot = unit(rng), unit(rng), *rng.normal(size=(3, 3))
-        if product(q_d * [1, -1, -1, -1], q)[0] < 0:
-            q_d = -q_d
-        torque, _ = body.law(q, omega, q_d, omega_d, omega_d_dot, body.state)
-        omega_dot = body.omega_dot(q, omega, torque)
-
-        def at(t: float, motion: Any = (q, q_d, omega, omega_d, omega_dot, omega_d_dot)) -> tuple[Array, Array]:
-            """Error quaternion and rate error a little later."""
-            q, q_d, omega, omega_d, omega_dot, omega_d_dot = motion
-            turned, desired = (
-                q + t / 2 * product(q, np.append(0, omega)),
-                q_d + t / 2 * product(np.append(0, omega_d), q_d),
-            )
-            turned, desired = turned / np.linalg.norm(turned), desired / np.linalg.norm(desired)
-            rate_error = omega + t * omega_dot - twin.rotation(turned).T @ (omega_d + t * omega_d_dot)
-            return product(desired * [1, -1, -1, -1], turned), rate_error
-
-        if kind == "pd":
-            falling = slope_of(lambda t, at=at: 2 * 1.3 * (1 - at(t)[0][0]) + at(t)[1] @ (body.J * at(t)[1]) / 2)
-            assert falling == pytest.approx(-at(0)[1] @ (np.array(body.p.kd) * at(0)[1]), rel=1e-6)
-        else:
-            slope, K, layer = (np.array(getattr(body.p, name)) for name in ("slope", "strength", "layer"))
-            sigma = at(0)[1] + slope * at(0)[0][1:]
-            towards = body.J * slope_of(lambda t, at=at, slope=slope: at(t)[1] + slope * at(t)[0][1:])
-            assert towards == pytest.approx(-K * np.tanh(sigma / layer), rel=1e-6)
-
-
 def test_the_other_equilibrium_is_approached_only_once_it_is_nearer_by_the_hysteresis() -> None:
     eta_e, before = ca.SX.sym("eta_e"), ca.SX.sym("before")
     sign = ca.Function("sign", [eta_e, before], [nearer(eta_e, before, 0.4)])
