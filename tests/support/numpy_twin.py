@@ -11,6 +11,7 @@ Vectors have shape (3,), quaternions (4,) with the scalar first.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TypeAlias
 
 import numpy as np
@@ -59,25 +60,10 @@ class Body:
     centre: Array
 
 
-@dataclass(frozen=True)
-class LawState:
-    """What the law computes on its way, by the paper's letters."""
-
-    e: Array
-    omega_e: Array
-    z1: Array
-    z2: Array
-    alpha: Array
-    alpha_bar: Array
-    u: Array
-    tau: Array
-    theta_dot: Array
-
-
 def law(
     p: Body, q: Array, omega: Array, q_d: Array, omega_d: Array, omega_d_dot: Array, theta: Array, s: float
-) -> LawState:
-    """(C.37) and (C.38) with all that they need; s is the upper (+1) or lower (−1) sign of the paper's ±."""
+) -> SimpleNamespace:
+    """(C.37), (C.38) and all on their way, by the paper's letters; s is the upper (+1) or lower (−1) sign of its ±."""
     eta, eps, eta_d, eps_d = q[0], q[1:], q_d[0], q_d[1:]
     e = np.empty(4)
     e[0] = eta_d * eta + eps_d @ eps  # (C.32)
@@ -98,7 +84,10 @@ def law(
     feedforward = np.cross(omega, R_i_Q @ omega_d) - R_i_Q @ omega_d_dot - alpha_bar
     u = np.linalg.inv(p.B) @ (-G @ z1 - p.C2 @ z2 - Phi @ theta - Psi - p.J @ feedforward)  # (C.37)
     tau = p.Gamma @ Phi @ z2
-    return LawState(e, omega_e, z1, z2, alpha, alpha_bar, u, tau, projected(p, theta, tau))
+    theta_dot = projected(p, theta, tau)
+    return SimpleNamespace(
+        e=e, omega_e=omega_e, z1=z1, z2=z2, alpha=alpha, alpha_bar=alpha_bar, u=u, tau=tau, theta_dot=theta_dot
+    )
 
 
 def projected(p: Body, theta: Array, tau: Array) -> Array:
@@ -157,19 +146,12 @@ class Sinusoids:
 
 @dataclass
 class LockedBody:
-    """A rigid body on the Aero's mechanism, by (C.2) plus the torque that holds its roll.
-
-    Attributes:
-        body: J, m, g and r_g; the gains are not used.
-        thrust: Torque of two motors about three axes [N·m/V]. Shape (3, 2).
-        damping: θ [N·m·s/rad].
-        x: [pitch, yaw, their rates] in rad and rad/s.
-    """
+    """A rigid body on the Aero's mechanism, by (C.2) plus the torque that holds its roll."""
 
     body: Body
-    thrust: Array
-    damping: Array
-    x: Array
+    thrust: Array  # torque of two motors about three axes [N·m/V]. Shape (3, 2)
+    damping: Array  # θ [N·m·s/rad]
+    x: Array  # pitch, yaw [rad], their rates [rad/s]
 
     @property
     def q(self) -> Array:
