@@ -31,10 +31,8 @@ def page(reports: Sequence[Report]) -> str:
         raise ValueError("a page needs a run")
     from plotly.offline import get_plotlyjs
 
-    loader = FileSystemLoader(HERE)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    blocks = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, **blocks)
     environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
     environment.tests["grave"] = rows.grave
     scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]
@@ -65,10 +63,7 @@ def page(reports: Sequence[Report]) -> str:
 
 
 def verdict(run: Findings) -> tuple[str, bool | None, str]:
-    """Verdict on a run in a word, whether it is good (None: nothing was required), and because of what.
-
-    By the limits of `--require`; without any, by trips, missing figures, faults and losses.
-    """
+    """Verdict on a run in a word, whether it is good (None: nothing was required), and because of what."""
     found: tuple[str, bool | None, str]
     troubles, limits = sum(map(rows.grave, run.marks)), rows.count(len(run.checks), "limit")
     if broken := sum(not check.holds for check in run.checks):

@@ -1,7 +1,6 @@
 """Panels of a session: every quantity over time, in the order of the paper's figures and with their numbers.
 
-A run is one of the paper's three cases, and its titles have the paper's numbers where the paper has that figure. Every
-tick is drawn while there are few enough; of more, the least and the largest value of each bucket.
+Every tick is drawn while there are few enough; of more, the least and the largest value of each bucket.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Ticks, euler_deg
-from aeroloop.service.review.events import Truths
-from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
+from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
 from aeroloop.service.review.theorem import TheoremCheck
 
@@ -35,8 +33,7 @@ NUMBERS: Final[dict[str, dict[str, str]]] = {
 
 NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))  # of a log without true states
 
-_Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
-"""Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""
+_Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]  # group, title, label of each column, unit, lines
 
 
 def case_of(settings: Settings) -> str:

@@ -136,8 +136,7 @@ class Limit(NamedTuple):
     def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
         """Whether it holds, and what was found.
 
-        A limit that seems to hold does not where ticks or parts of files are unseen, unless `limits`, which are
-        required together with it, permit as many `missing_ticks` or `damages`.
+        It does not where ticks or parts of files are unseen, unless `limits` permit so many `missing_ticks`, `damages`.
         """
         value, unit = value_of(findings, self.path), LIMITED[self.path]
         space = "" if unit in ("", "°") else " "

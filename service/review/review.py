@@ -1,7 +1,6 @@
 """Review of a log: every figure and finding, from the log alone.
 
-The log holds the configuration (roles' descriptions) and what each end did (traces), so the review recomputes the
-controller, bit for bit. Of several sessions, it judges the longest, unless one is named.
+The log holds the configuration and what each end did, so the review recomputes the controller, bit for bit.
 """
 
 from __future__ import annotations
@@ -22,15 +21,24 @@ from aeroloop.service.figures import Figures, figures
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, Session, Unknown
 from aeroloop.service.logs.ticks import Ticks, recompute
-from aeroloop.service.review.events import Messages, Truths, age_us, fault_intervals, happened, read_messages
-from aeroloop.service.review.observations import gaps, lapses, saturation, timing
+from aeroloop.service.review.events import (
+    Messages,
+    Truths,
+    age_us,
+    fault_intervals,
+    gaps,
+    happened,
+    lapses,
+    read_messages,
+    saturation,
+    timing,
+)
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
 from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, differences, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
 LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration is a loop's"
-"""Why a session in lockstep has no durations."""
 
 OWN_AFFAIRS: Final = (
     "loop.realtime", "loop.cpus", "plant.via", "plant.faults", "plant.fault_seed", "plant.armed_at_start",
@@ -59,9 +67,10 @@ class Review:
 
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
-        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points, self.truths)
-        findings, settings = self.checked(limits), self.settings.description()
-        return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
+        drawn = panels_of(self.settings, self.ticks, self.theorem, points, self.truths)
+        return Report(
+            self.name, self.checked(limits), *drawn, self.settings.description(), facts=self.facts, part=self.part
+        )
 
 
 def review(*paths: Path) -> Figures:
@@ -79,8 +88,7 @@ def read(
 ) -> Review:
     """Read a run (logs, folders, or the files of a rotated run) and judge a session, or of it what is in this time [s].
 
-    Session and vehicle are as of `Recording.choose`, the time is the law's. Raises ReviewError: Not a log, several
-    unrelated runs, no such session, or nothing of it in this time.
+    Session and vehicle are as of `Recording.choose`, the time is the law's. Raises ReviewError.
     """
     try:
         recording = Recording(paths, progress)
@@ -177,7 +185,7 @@ def read(
 
 
 def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:
-    """Facts about software and host by role: of descriptions, of the recorder's metadata, and the statuses' notes."""
+    """Facts about software and host by role."""
     described = session.descriptions.items()
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in described}
     for kind, values in recording.metadata.items():

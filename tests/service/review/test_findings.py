@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status
 from aeroloop.protocol.messages.trace import Outcome, Received, read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.review.observations import gaps
+from aeroloop.service.review.events import gaps
 from aeroloop.service.review.report import Check, Findings
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import LOCKSTEP, read
