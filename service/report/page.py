@@ -31,7 +31,7 @@ def page(reports: Sequence[Report]) -> str:
         raise ValueError("a page needs a run")
     from plotly.offline import get_plotlyjs
 
-    blocks = {"trim_blocks": True, "lstrip_blocks": True}
+    blocks: Json = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, **blocks)
     environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
     environment.tests["grave"] = rows.grave

@@ -37,7 +37,6 @@ time.sleep = lambda seconds: sleep(seconds / rate)
 
 
 def python_clocks(tmp_path: Path, **environment: str) -> dict[str, str]:
-    """The environment of a process with such clocks."""
     (tmp_path / "site").mkdir(exist_ok=True)
     (tmp_path / "site" / "sitecustomize.py").write_text(CLOCKS)
     return {"PYTHONPATH": str(tmp_path / "site"), **environment}

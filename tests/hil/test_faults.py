@@ -37,7 +37,6 @@ def seconds_driven_after(log: HilLog, moment_ns: int) -> float:
 
 
 def events(log: HilLog, *kinds: str) -> list[tuple[int, Event]]:
-    """Events of some kinds with their times [ns]."""
     return [(at, event) for at, event in log.messages(Event) if event.kind in kinds]
 
 

@@ -57,7 +57,6 @@ def test_a_failed_test_names_its_page_events_and_output_and_a_passed_one_has_no_
 
 
 def operated(folder: Path) -> tuple[list[object], list[float]]:
-    """Operate a loop in lockstep; its changes without session names, and its figures."""
     with Hil(folder, lockstep=True) as hil:
         hil.start(settings={"reference": {"kind": "hold"}, "loop": {"rate_hz": 200}})
         hil.goto(0, 0, 0, in_s=1)  # before the first tick

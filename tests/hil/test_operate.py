@@ -24,12 +24,10 @@ from tests.support.processes import PATIENT, aeroloop
 
 
 def op(hil: Hil, *words: str) -> str:
-    """What a verb prints that must succeed."""
     return aeroloop("op", *words, "--set", f"network.rendezvous={hil.settings.network.rendezvous}")
 
 
 def refused(hil: Hil, *words: str, code: int = 1) -> str:
-    """What a verb prints that must be refused in one line."""
     said = aeroloop("op", *words, "--set", f"network.rendezvous={hil.settings.network.rendezvous}", code=code)
     assert len(said.splitlines()) == 1
     return said

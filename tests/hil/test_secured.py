@@ -67,7 +67,6 @@ STRANGERS: Final = {
 
 
 def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:
-    """Do with these topics what would end, steal or disturb a running session."""
     requests: dict[str, Message] = {
         **dict.fromkeys(("stop", "stand_down", "arm"), Request()),
         "release": Release(session=running),

@@ -55,7 +55,6 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
 
 
 def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
-    """Constants of experiments, so many of each configuration."""
     together = {name: np.array([one[name] for one in known], dtype=float) for name in known[0]}
     return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
 
@@ -87,14 +86,12 @@ def by(matrix: Array, v: Array) -> Array:
 
 
 def to_body(q: Array, v: Array) -> Array:
-    """Rᵀ(q) v."""
     t = 2 * cross(q[..., 1:], v)
     found: Array = v - q[..., :1] * t + cross(q[..., 1:], t)
     return found
 
 
 def times(p: Array, q: Array) -> Array:
-    """p ∘ q."""
     (a, b), (s, v) = (p[..., :1], p[..., 1:]), (q[..., :1], q[..., 1:])
     return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
 
@@ -106,7 +103,6 @@ def attitude_of(angle: Array) -> Array:
 
 
 def desired(c: Any, t: Array) -> Motion:
-    """The reference at times t, one a row."""
     turn = c.frequency * t[:, None]
     angle, rate = c.amplitude * np.sin(turn), c.amplitude * c.frequency * np.cos(turn)
     (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = angle.T, rate.T, (-(c.frequency**2) * angle).T
@@ -125,7 +121,6 @@ def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
 
 
 def drift(c: Any, q: Array, omega: Array) -> Array:
-    """Ψ: what the body turns by without command and damping."""
     return cross(c.r_g, to_body(q, c.weight)) - cross(omega, c.J * omega)
 
 
@@ -150,7 +145,6 @@ def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
 
 
 def rotor_lag(c: Any, V: Array, u: Array) -> Array:
-    """Each rotor's time constant now [s]."""
     lag: Array = np.where((u - V) * V >= 0, c.up, c.down)
     return lag
 

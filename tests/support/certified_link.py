@@ -26,7 +26,6 @@ _BY: Final = zenoh.Locality.REMOTE
 
 
 def tls(certificate: Path) -> dict[str, Any]:
-    """Zenoh's settings of TLS with a certificate, with its key and its authority beside it."""
     own, key = str(certificate), str(certificate.with_suffix(".key"))
     return {
         "root_ca_certificate": str(certificate.with_name("ca.pem")),
@@ -45,7 +44,6 @@ def open_session(
     access: dict[str, Any] | None = None,
     mode: str = "peer",
 ) -> zenoh.Session:
-    """Open a session with a certificate, and with access rules, if any."""
     tree = {
         "mode": mode,
         "listen": {"endpoints": list(listen)},
@@ -72,8 +70,6 @@ def with_marker(access: dict[str, Any], *, egress_open: bool = False) -> dict[st
 
 
 class Pair(NamedTuple):
-    """Two linked sessions."""
-
     guard: zenoh.Session
     hand: zenoh.Session
 

@@ -18,15 +18,11 @@ Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape"]
 
 
 class FailingSettings(LawSettings):
-    """What shall go wrong."""
-
     failure: Failure | Literal["hangs"] = Field(default="raises", description="what goes wrong")
     at: int = Field(default=3, description="at which tick")
 
 
 class Failing(PythonLaw[FailingSettings]):
-    """Counts its ticks, and fails at one of them."""
-
     Settings = FailingSettings
 
     def reset(self) -> None:
@@ -54,14 +50,10 @@ class Failing(PythonLaw[FailingSettings]):
 
 
 class MistakenSettings(LawSettings):
-    """Which of a beginner's mistakes is made."""
-
     mistake: Literal["width", "state", "no such vector"] = Field(description="what is wrong with it")
 
 
 class Mistaken(ExpressionLaw[MistakenSettings]):
-    """Expressions that cannot be built."""
-
     Settings = MistakenSettings
 
     def initial(self) -> Mapping[str, Sequence[float]]:
@@ -80,8 +72,6 @@ class Mistaken(ExpressionLaw[MistakenSettings]):
 
 
 class Picky(PythonLaw[LawSettings]):
-    """Cannot be made."""
-
     Settings = LawSettings
 
     def __init__(self, settings: LawSettings, period: float, actuators: int) -> None:
@@ -96,8 +86,6 @@ class Picky(PythonLaw[LawSettings]):
 
 
 class Runaway(ExpressionLaw[LawSettings]):
-    """Pushes where it should pull."""
-
     Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:

@@ -48,7 +48,6 @@ def acceleration(p: LawSettings, q: Array, omega: Array, torque: Array) -> Array
 
 
 def errors(q: Array, omega: Array, q_d: Array, omega_d: Array) -> tuple[Array, Array]:
-    """e and ω_e."""
     return product(q_d * [1, -1, -1, -1], q), omega - twin.rotation(q).T @ omega_d
 
 

@@ -59,7 +59,6 @@ class Clock:
         self._rate = 1.0 + drift
 
     def at(self, now_ns: int) -> int:
-        """Its monotonic clock at an instant [ns]."""
         return self._monotonic_ns + round(now_ns * self._rate)
 
     def monotonic_ns(self) -> int:
@@ -85,8 +84,6 @@ class Logged(NamedTuple):
 
 
 class Messages:
-    """What is to be recorded, in order."""
-
     def __init__(self) -> None:
         self.all: list[Logged] = []
 
@@ -275,7 +272,6 @@ def made(
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
 
     def publish(k: int) -> None:
-        """Events and a status of the plant."""
         for notice in endpoint.notices:
             messages.add("event", Event(role="plant", **notice._asdict()).encode(), plant_clock, "plant")
         endpoint.notices.clear()

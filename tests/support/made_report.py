@@ -92,7 +92,11 @@ def with_faults(report: Report, *faults: tuple[str, float, float | None]) -> Rep
 
 def made_theorem(*, broken: int = 0) -> TheoremFindings:
     """A theorem that holds of a run, two of whose inequalities were judged; the second was broken so often."""
-    nearest = {"closest_s": 4.25, "closest": 1.25 if broken else 0.97, "broken_s": 3.125 if broken else None}
+    nearest: dict[str, Any] = {
+        "closest_s": 4.25,
+        "closest": 1.25 if broken else 0.97,
+        "broken_s": 3.125 if broken else None,
+    }
     return TheoremFindings(
         verdict="Holds: once there, ‖z‖ stays within 0.2004.", held=not broken, holds=True, pointwise_radius=0.2004,
         pointwise_deg=23.01, pointwise_share=0.52, pointwise_at_s=1.5, pointwise_judged=450, pointwise_since_s=1.0,

@@ -112,7 +112,6 @@ class Sinusoids:
     frequency: Array
 
     def angles(self, t: float) -> tuple[Array, Array, Array]:
-        """The angles and their first and second derivatives."""
         a, w = self.amplitude, self.frequency
         return a * np.sin(w * t), a * w * np.cos(w * t), -a * w * w * np.sin(w * t)
 
@@ -161,7 +160,6 @@ class LockedBody:
 
     @property
     def omega(self) -> Array:
-        """ω in the body frame."""
         p, _, dp, dy = self.x
         return np.array([-np.sin(p) * dy, dp, np.cos(p) * dy])
 

@@ -53,7 +53,6 @@ def measured(k: int, codes: list[float] | None = None) -> bytes:
 
 
 def turned(yaw: float) -> list[float]:
-    """The codes of a body at rest that has yawed [deg]."""
     attitude, rate = WIRE.attitude.quantizer(), WIRE.rate.quantizer()
     return [*(attitude.encode(x) for x in (0.0, 0.0, sin(radians(yaw) / 2))), *(rate.encode(0.0) for _ in range(3))]
 
@@ -78,8 +77,6 @@ class Query:
 
 
 class Network:
-    """A Zenoh session without any other: it keeps what is declared and what is put."""
-
     def __init__(self) -> None:
         self.put: list[tuple[str, bytes]] = []
         self.queryables: dict[str, Callable[[Any], None]] = {}
@@ -99,8 +96,6 @@ class Network:
 
 
 class LonelyNode(Node):
-    """A role whose publications stay on the network of the test."""
-
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         del per_s, lossless
         network: Any = self.zenoh
@@ -128,7 +123,6 @@ class Loop:
         self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}
 
     def fresh(self, reference: Reference | None = None) -> Controller:
-        """A controller as the configuration makes it, or with another reference."""
         return Controller(WIRE, LAW, reference or self.configured, PERIOD)
 
     # The loop
@@ -158,14 +152,12 @@ class Loop:
             self.tick()
 
     def malformed(self) -> None:
-        """Something comes that is no measurement; the daemon counts it as the one that was due."""
         self.live.before_tick(self.k, b"junk")
         assert self.controller.tick(b"junk", self.k) is None
 
     # The operator
 
     def ask(self, topic: str, message: Message | bytes) -> Query:
-        """Put a question; it is answered between two ticks."""
         key = topics.key(topic, "aero")
         query = Query(key, message if isinstance(message, bytes) else message.encode())
         self.network.queryables[key](query)
@@ -178,7 +170,6 @@ class Loop:
         return answer
 
     def stream(self, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> None:
-        """A set-point comes [deg]."""
         self.raw(Setpoint(attitude=(roll, pitch, yaw)).encode())
 
     def raw(self, payload: bytes) -> None:
@@ -197,7 +188,6 @@ class Loop:
         return [event.text for event in self.published("event", Event) if event.kind == kind]
 
     def yaw(self) -> float:
-        """Of q_d at the last tick, level [deg]."""
         w, x, y, z = self.controller.desired
         assert (x, y) == (0.0, 0.0)
         return degrees(2 * atan2(z, w))

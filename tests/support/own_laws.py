@@ -48,8 +48,6 @@ class Expressions(ExpressionLaw[PDSettings]):
 
 
 class Python(PythonLaw[PDSettings]):
-    """The same, operation by operation."""
-
     Settings = PDSettings
     gains = ("kp", "kd", "ki")
 
@@ -105,8 +103,6 @@ class Cyclic(Python):
 
 
 class Bare(ExpressionLaw[LawSettings]):
-    """No gain that may change, and no state."""
-
     Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
@@ -115,8 +111,6 @@ class Bare(ExpressionLaw[LawSettings]):
 
 
 class BarePython(PythonLaw[LawSettings]):
-    """Likewise."""
-
     Settings = LawSettings
 
     def reset(self) -> None:
@@ -129,8 +123,6 @@ class BarePython(PythonLaw[LawSettings]):
 
 
 class OffsetSettings(LawSettings):
-    """One gain."""
-
     offset: Annotated[float, Field(gt=0, le=5)] = 0.5
 
 

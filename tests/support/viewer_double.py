@@ -61,13 +61,11 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def quaternion(data: bytes) -> Quaternion:
-    """[w, x, y, z] of a foxglove.Quaternion."""
     x, y, z, w = (fields(data).get(number, [0.0])[0] for number in (1, 2, 3, 4))
     return w, x, y, z
 
 
 def orientation(pose_in_frame: bytes) -> Quaternion:
-    """Of a foxglove.PoseInFrame."""
     pose = fields(fields(pose_in_frame)[3][0])
     return quaternion(pose[2][0])
 
@@ -109,7 +107,6 @@ class Viewer:
         self._connecting.__exit__(kind, error, trace)
 
     def await_topics(self, *topics: str) -> None:
-        """Listen until all of these have been advertised."""
         while not set(topics) <= set(self.channels):
             self._read()
 
@@ -121,7 +118,6 @@ class Viewer:
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
     def first(self, topic: str) -> Shown:
-        """The next message of a topic."""
         while True:
             if (message := self._read()) is not None and message[0] == topic:
                 return message[1]

@@ -43,13 +43,11 @@ def triples(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
 
 
 def seconds(least: float, most: float) -> st.SearchStrategy[float]:
-    """Times to the millisecond [s]."""
     return st.integers(round(1000 * least), round(1000 * most)).map(lambda n: n / 1000)
 
 
 @st.composite
 def some_points(draw: st.DrawFn) -> Points:
-    """Two to six points, 0.05 s to 3 s from each other."""
     gaps = draw(st.lists(seconds(0.05, 3.0), min_size=1, max_size=5))
     times = [0.0, *(float(t) for t in np.cumsum(gaps))]
     return Points(times=times, attitudes=draw(st.lists(triples(60), min_size=len(times), max_size=len(times))))
@@ -125,8 +123,6 @@ def way(trajectory: Trajectory, target: Trajectory, end: float) -> Angles:
 
 
 def desired_of(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """The twin's q_d, ω_d, ω̇_d of any angles, rates, accelerations."""
-
     class Now(Sinusoids):
         def angles(self, _t: float) -> tuple[Array, Array, Array]:
             return state
@@ -135,7 +131,6 @@ def desired_of(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
 
 
 def quaternion(degrees: Sequence[float]) -> Array:
-    """The twin's q_d of angles that stand still."""
     return desired_of((np.radians(degrees), np.zeros(3), np.zeros(3)))[0]
 
 
@@ -165,12 +160,10 @@ class Followed:
         self.trajectory = Trajectory.of(reference)
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """q_d, ω_d, ω̇_d as the loop reads them."""
         q_d, omega_d, omega_d_dot = map(np.array, self.motion.at(t))
         return q_d, omega_d, omega_d_dot
 
     def follow(self, reference: Reference, t: float, approach: Approach) -> None:
-        """Follow something else, and know the trajectory of that."""
         here = Angles(*(part[None] for part in states(self.trajectory, t)))
         self.trajectory = approached(Trajectory.of(reference), here, t, approach)
         self.motion.follow(Trajectory.of(reference), t, approach)

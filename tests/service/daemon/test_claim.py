@@ -18,7 +18,6 @@ from aeroloop.service.daemon.claim import ClaimClient
 
 
 def record(yaw: float) -> SessionRecord:
-    """Of a session s."""
     return SessionRecord(
         controller="c", session="s", gains=Gains(), gains_from="configured", reference=Hold(attitude=(0.0, 0.0, yaw)),
         reference_from="operator", within_s=0.0, since_tick=0,
@@ -58,14 +57,11 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
 
 
 class Plant:
-    """A Zenoh session on which a plant answers, or none."""
-
     def __init__(self, status: bytes | None, claim: Message | None = None) -> None:
         answer = (claim or Grant(session="s")).encode()
         self._answers = {} if status is None else {"status": status, "claim": answer}
 
     def get(self, key: str, **_: object) -> list[SimpleNamespace]:
-        """What the plant answers."""
         answers = [answer for topic, answer in self._answers.items() if f"/{topic}" in key]
         return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers]
 

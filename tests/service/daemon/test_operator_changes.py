@@ -153,7 +153,6 @@ def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop
 
 @pytest.fixture
 def streaming(loop: Loop) -> Loop:
-    """A loop that follows a stream, at rest and level, at tick 50."""
     loop.ask("track", Track(reference=Stream(timeout_s=0.5, within_s=0.2), within_s=0.05))
     loop.run(0.1)
     return loop

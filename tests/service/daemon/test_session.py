@@ -36,8 +36,6 @@ def arrival(k: int, codes: Iterable[float] = AT_REST) -> Arrival:
 
 
 class Plant(Network):
-    """A network on which nobody answers."""
-
     def get(self, *_: object, **__: object) -> list[object]:
         return []
 
@@ -65,27 +63,23 @@ class Stage:
         self.published += 1
 
     def run(self) -> bool:
-        """Run to the end: whether its duration is over."""
         finished = self.session.run()
         self.session.end()
         return finished
 
     @property
     def commands(self) -> list[list[float]]:
-        """The voltages of the commands that were sent [V]."""
         read = [WIRE.command.unpack(frame) for _, frame in self.link.sent]
         return [[WIRE.voltage.quantizer().level(code) for code in codes] for _, codes in filter(None, read)]
 
     @property
     def rows(self) -> list[tuple[int, int]]:
-        """Tick and Sent of each row in the published trace."""
         key = topics.key("trace", "aero", role="controller")
         batches = filter(None, (read_batch(payload) for at, payload in self.network.put if at == key))
         columns = [(batch.columns["tick"].tolist(), batch.columns["sent_as"].tolist()) for batch in batches]
         return [row for tick, sent_as in columns for row in zip(tick, sent_as, strict=True)]
 
     def status_of_plant(self, session: str, cause: str | None = None) -> None:
-        """A status of the plant is received."""
         status = Status(
             role="plant", state="idle", session=session, cause=cause, uptime_s=0, ticks=0, rate_hz=0, skipped=0
         )
@@ -133,8 +127,6 @@ passing: list[Callable[[], None]] = []
 
 
 class Dawdling(Failing):
-    """Takes its time at its third tick."""
-
     def step(self, now: Now[Floats]) -> Any:
         if now.state["ticks"] == 2:
             passing[-1]()

@@ -20,12 +20,10 @@ TARGET = Hold(attitude=(0.0, 0.0, 60.0))
 
 
 def of(after_restart: str, reference: Reference = SWING) -> Loop:
-    """A controller that starts; its configured reference moves."""
     return Loop(reference, ControllerSettings.model_validate({"after_restart": after_restart}))
 
 
 def record(reference: Reference, *, ended: TripCause = TripCause.HOLDER_GONE) -> SessionRecord:
-    """What the plant has of the session before."""
     return SessionRecord(
         controller="controller-6", session="s", gains=GAINS, gains_from="operator", reference=reference,
         reference_from="operator", within_s=2.0, since_tick=0, ended=ended, ended_tick=5000,
@@ -33,7 +31,6 @@ def record(reference: Reference, *, ended: TripCause = TripCause.HOLDER_GONE) ->
 
 
 def asked(loop: Loop, reference: Reference = TARGET) -> None:
-    """An operator sets gains and a reference, and it is reached."""
     loop.ask("set_gains", GAINS)
     loop.ask("track", Track(reference=reference, within_s=3.0))
     loop.run(4.0)

@@ -73,12 +73,10 @@ def two(open_page: Open) -> Page:
 
 
 def plot(opened: Page, name: str, expression: str) -> Any:
-    """The value of an expression of a group's `plot`."""
     return opened.locator(f".plot[data-name={name}]").evaluate(f"(plot) => {expression}")
 
 
 def wait_for(opened: Page, name: str, condition: str) -> None:
-    """Wait until a condition of a group's `plot` holds."""
     plot = f"const plot = document.querySelector('.plot[data-name={name}]');"
     opened.wait_for_function(f"() => {{ {plot} return {condition}; }}")
 

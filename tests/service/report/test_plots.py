@@ -38,7 +38,6 @@ def svg_only(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def only(made: Report, group: str) -> Report:
-    """A report with this group alone: each figure takes a while to draw."""
     return replace(made, panels=[panel for panel in made.panels if panel.group == group])
 
 

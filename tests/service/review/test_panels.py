@@ -24,7 +24,6 @@ Drawn = dict[tuple[str, str], Line]
 
 
 def drawn(ticks: Ticks, truths: Truths = NO_TRUTHS) -> Drawn:
-    """What is drawn of ticks of the default configuration."""
     _, panels, _ = panels_of(load(), ticks, check_theorem(load(), ticks, truths))
     return {(panel.label, line.label): line for panel in panels for line in panel.lines}
 

@@ -29,7 +29,6 @@ def of_vehicle(messages: list[Logged], vehicle: str) -> list[Logged]:
 
 
 def described(settings: Settings, role: str, vehicle: str = VEHICLE, at_ns: int = 0) -> Logged:
-    """A description as a message."""
     text = description(settings, role).model_copy(update={"vehicle": vehicle}).model_dump_json()
     return Logged(START_NS + at_ns, topics.key("description", vehicle, role=role), text.encode(), START_NS + at_ns)
 
@@ -105,7 +104,6 @@ def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_l
 
 
 def recorded(path: Path, messages: list[Logged], identity: str | None) -> Path:
-    """A log that a recorder of this identity wrote."""
     settings = load()
     write(path.with_suffix(".plain"), settings, messages)
     entry = {"json": f'{{"run": "a", "part": "a", "id": "{identity}"}}'}

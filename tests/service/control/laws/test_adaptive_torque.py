@@ -59,7 +59,6 @@ def descent(rng: np.random.Generator, pressed: bool) -> tuple[float, float, floa
     omega_dot = acceleration(p, q, omega, np.array(p.allocation) @ found["u"] - friction + theta[0])
 
     def lyapunov(t: float) -> tuple[float, Array, Array]:
-        """V, ε̃ and z₂ a little later."""
         e, omega_e = errors_at(t, q, omega, omega_dot, q_d, omega_d, omega_d_dot)
         z2 = omega_e + C1 * sign * e[1:]
         wrong = theta - learned - t * rates

@@ -30,8 +30,6 @@ PERIOD = 0.002
 
 
 class Body:
-    """A body, and a law that knows it."""
-
     def __init__(self, kind: str, rng: np.random.Generator, **fields: Any) -> None:
         B = (rng.normal(size=(3, 3)) + 3 * np.eye(3)) / 10  # well away from singular
         body = CustomLawSettings(
@@ -45,14 +43,12 @@ class Body:
         self.tick, self.B = Tick(section), B
 
     def moved(self, q: Array, omega: Array, q_d: Array, state: Array) -> tuple[Array, Array]:
-        """ω̇ and the next state, with a reference at rest."""
         found = self.tick(state, q, omega, q_d, np.zeros(3), np.zeros(3))
         torque = self.B @ found["u"] - self.theta * omega
         return acceleration(self.tick.law.settings, q, omega, torque), found["state_next"]
 
 
 def slope_of(value: Any, h: float = 1e-6) -> Any:
-    """Central difference of a function at 0."""
     return (value(h) - value(-h)) / (2 * h)
 
 
@@ -93,7 +89,6 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
     for axis in range(3):
 
         def derivative(x: Array, axis: int = axis) -> Array:
-            """Of the axis's angle, rate and further state."""
             error, omega, state = np.zeros(3), np.zeros(3), first.copy()
             error[axis], omega[axis], state[0] = x[0] / 2, x[1], 1.0
             if extra:

@@ -39,7 +39,6 @@ def law(kind: str, *overrides: str) -> Any:
 
 
 def refused(kind: str, *overrides: str) -> str:
-    """The one line that a user gets."""
     with pytest.raises((LawError, PluginError)) as error:
         law(kind, *overrides)
     (line,) = str(error.value).splitlines()
@@ -52,7 +51,6 @@ def controller(kind: str, *overrides: str, wire: WireSpec = CONTINUOUS, still: b
 
 
 def measurement(wire: WireSpec, k: int, *values: float) -> bytes:
-    """The frame of tick k with these ε and ω."""
     quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
     codes = [quantizer.encode(value) for quantizer, value in zip(quantizers, values, strict=True)]
     return wire.measurement.pack(k % wire.measurement.counters, codes)
