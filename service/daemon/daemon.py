@@ -137,7 +137,7 @@ class Daemon:
         self._shown = state, record
         self._shared.claims.keep(record)
         shared.age.turn_when_due()
-        refused = counts.refused + shared.changes.setpoints.refused + (session.refused if session else 0)
+        refused = counts.refused + shared.changes.refused + (session.refused if session else 0)
         self._role.status(
             Status(
                 role=self._role.role,

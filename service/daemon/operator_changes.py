@@ -58,7 +58,9 @@ class OperatorChanges:
         self._configured, self._after_restart = reference, own.after_restart
         rolls = settings.wire.actuators > 2
         self._limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=rolls)
-        self.setpoints = SetpointStream(role)
+        self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
+        self._setpoint_s = 0.0  # when the stream last had a set-point, or began; 0 once its silence was an event
+        self.refused = 0  # set-points so far, malformed or beyond the limits
         self._controller: Controller | None = None
         self._k = 0
         self._started_near = True
@@ -122,7 +124,8 @@ class OperatorChanges:
         else:
             approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
-        self.setpoints.begin()
+        self._discard_setpoints()
+        self._setpoint_s = self._role.clock.monotonic()
         words = in_words(reference if isinstance(reference, Stream) else held)
         text = f"follows {words} within {approach.within_s:.4g} s"
         self._approach(held, trajectory, approach, text, reference, source)
@@ -140,7 +143,7 @@ class OperatorChanges:
         controller.set_gains(self.record.gains)
         controller.motion.follow(Trajectory.of(self._present_reference), 0.0, Approach())
         self._started_near = False
-        self.setpoints.discard()
+        self._discard_setpoints()
         self._record_change(gains=self.record.gains, reference=self._present_reference)
 
     def end(self) -> None:
@@ -220,17 +223,38 @@ class OperatorChanges:
         self._role.take_inbox()
 
     def _follow_stream(self, stream: Stream) -> None:
-        hold = self.setpoints.newest(stream, self._limits, self.record.session, self._k)
-        if hold is None:
-            return
-        trajectory = Trajectory.of(hold)
-        try:
-            here = self._running().motion.here(self._time)
-            approach = to_set_point(trajectory, here, stream.within_s, self._limits)
-        except FollowError as error:
-            self.setpoints.refuse(error, self.record.session)
-            return
-        self._follow(hold, trajectory, approach)
+        """Follow the newest set-point received since the last tick that is not refused; report a silent stream."""
+        now_s, newest = self._role.clock.monotonic(), None
+        for _ in range(SETPOINTS):
+            if (sample := self._received.try_recv()) is None:
+                break
+            try:
+                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
+                trajectory = Trajectory.of(hold)
+                trajectory.check(self._limits)
+                newest = hold, trajectory
+            except (MessageError, FollowError) as error:
+                self._refuse_setpoint(error)
+        if newest is not None:
+            self._setpoint_s = now_s
+            try:
+                here = self._running().motion.here(self._time)
+                self._follow(*newest, to_set_point(newest[1], here, stream.within_s, self._limits))
+            except FollowError as error:
+                self._refuse_setpoint(error)
+        elif self._setpoint_s and now_s - self._setpoint_s > stream.timeout_s:
+            self._setpoint_s = 0.0
+            text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
+            self._role.event("lost", text, self.record.session, self._k)
+
+    def _refuse_setpoint(self, error: AeroloopError) -> None:
+        self.refused += 1
+        self._role.warn("set-point", "fault", f"set-point refused: {error}", self.record.session)
+
+    def _discard_setpoints(self) -> None:
+        """Discard those received before now, which are of the previous stream or session."""
+        while self._received.try_recv() is not None:
+            pass
 
     def _approach(
         self, to: Reference, trajectory: Trajectory, approach: Approach, text: str, asked: Reference, source: Source
@@ -282,48 +306,3 @@ def hold_here(attitude: Quaternion, *, rolls: bool) -> Vector:
     """Roll, pitch, yaw at which the body is found [deg]; roll is 0 for a vehicle that cannot roll."""
     roll, pitch, yaw = (round(degrees(angle), _DECIMALS) for angle in to_euler(attitude))
     return (roll if rolls else 0.0, pitch, yaw)
-
-
-class SetpointStream:
-    """Set-points received for a role's vehicle, read in the loop."""
-
-    def __init__(self, role: Node) -> None:
-        self._role = role
-        self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
-        self._last_s = 0.0  # when the last one was read, or the stream begun; 0 once its silence was an event
-        self.refused = 0  # so far, malformed or beyond the limits
-
-    def discard(self) -> None:
-        """Discard those received before now, which are of the previous stream or session."""
-        while self._received.try_recv() is not None:
-            pass
-
-    def begin(self) -> None:
-        """Begin a stream: silence counts from now on."""
-        self.discard()
-        self._last_s = self._role.clock.monotonic()
-
-    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> Hold | None:
-        """The newest set-point received since the last tick that is not refused; silence of `timeout_s` is an event."""
-        now, newest = self._role.clock.monotonic(), None
-        for _ in range(SETPOINTS):
-            if (sample := self._received.try_recv()) is None:
-                break
-            try:
-                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
-                Trajectory.of(hold).check(limits)
-            except (MessageError, FollowError) as error:
-                self.refuse(error, session)
-            else:
-                newest = hold
-        if newest is not None:
-            self._last_s = now
-        elif self._last_s and now - self._last_s > stream.timeout_s:
-            self._last_s = 0.0
-            self._role.event("lost", f"no set-point for {stream.timeout_s:g} s: holds the last one", session, k)
-        return newest
-
-    def refuse(self, error: AeroloopError, session: str | None) -> None:
-        """Count a set-point that is not followed, and report it."""
-        self.refused += 1
-        self._role.warn("set-point", "fault", f"set-point refused: {error}", session)

@@ -195,7 +195,7 @@ def test_a_set_point_that_is_refused_is_counted_and_changes_nothing(streaming: L
     streaming.stream(3.0)
     streaming.raw(payload)
     streaming.run(0.3)
-    assert streaming.live.setpoints.refused == 1
+    assert streaming.live.refused == 1
     assert [len(text.splitlines()) for text in streaming.events("fault")] == [1]
     assert len(streaming.changes()) == len(before) + 1  # the good one that came before it
     assert streaming.yaw() == pytest.approx(3.0, abs=1e-12)
