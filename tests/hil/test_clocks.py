@@ -32,8 +32,7 @@ time.time = lambda: time.time_ns() * 1e-9
 time.monotonic_ns = lambda: monotonic() + gained()
 time.monotonic = lambda: time.monotonic_ns() * 1e-9
 time.sleep = lambda seconds: sleep(seconds / rate)
-"""
-"""Clocks wrong by CLOCK_WRONG [s] that run at CLOCK_RATE; the wall clock steps once the file CLOCK_STEP is there."""
+"""  # clocks wrong by CLOCK_WRONG [s] that run at CLOCK_RATE; the wall clock steps once the file CLOCK_STEP is there
 
 
 def python_clocks(tmp_path: Path, **environment: str) -> dict[str, str]:

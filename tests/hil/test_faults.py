@@ -14,16 +14,14 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Telemetry, Truth
+from aeroloop.protocol.messages.models import Event, Truth
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil, HilLog
-from tests.support.own_laws import HERE
 from tests.support.processes import AEROLOOP, PATIENT
 
 WATCHDOG_S = 0.1
-SLACK_S = 0.15
-"""For a loop that other work on the machine keeps waiting: it must run to notice anything."""
+SLACK_S = 0.15  # for a loop that other work on the machine keeps waiting: it must run to notice anything
 FAST_TRUTH = {"plant.truth_rate_hz": 500}
 
 
@@ -182,16 +180,3 @@ def test_faults_do_over_the_network_what_they_do_in_one_process(tmp_path: Path) 
         figures = hil.log.figures
     alone = run_experiment(load(overrides=[f"plant.faults={faults}"]), figures.duration_s)
     assert (figures.z_track, figures.u_total) == (alone.z_track, alone.u_total)
-
-
-# ── what a user's code leaves behind ──
-
-
-def test_the_cycles_that_a_law_in_python_drops_at_every_tick_are_collected_while_it_drives(hil: Hil) -> None:
-    """20 000 objects in 4 s, of which it keeps 1 000. A machine that stalls makes fewer ticks, and as many to keep."""
-    hil.start(settings={**PATIENT, "law.kind": f"{HERE}:Cyclic"})
-    hil.run(4.0)
-    assert hil.state("controller") == "running"
-    alive = [sample.state["alive"][0] for _, sample in hil.log.messages(Telemetry)]
-    assert len(alive) > 20
-    assert max(alive) < 7_000

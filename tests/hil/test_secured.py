@@ -62,8 +62,7 @@ STRANGERS: Final = {
     ("plant", "bero"): frozenset(topics.TOPICS),
     ("controller", "bero"): frozenset(topics.TOPICS),
     ("operator", "bero"): frozenset(topics.TOPICS),
-}
-"""Certificates, and topics that are not theirs."""
+}  # certificates, and topics that are not theirs
 
 
 def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:

@@ -23,13 +23,11 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 Array = npt.NDArray[np.float64]
-Motion = tuple[Array, ...]
-"""q_d, and ω_d and its derivative in the desired body frame."""
+Motion = tuple[Array, ...]  # q_d, and ω_d and its derivative in the desired body frame
 QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|")
 VERTICAL: Final = np.array([0.0, 0.0, 1.0])
 END_S: Final = 100 * 86_400.0
-_AT_ONCE: Final = 1e-3
-"""Lag of rotors in the costates of a body without any [s]."""
+_AT_ONCE: Final = 1e-3  # lag of rotors in the costates of a body without any [s]
 
 
 def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:

@@ -20,8 +20,7 @@ MARKER: Final = "marker"
 MESSAGES: Final = (
     *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
     *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
-)
-"""Every kind that Zenoh's rules tell apart."""
+)  # every kind that Zenoh's rules tell apart
 _BY: Final = zenoh.Locality.REMOTE
 
 

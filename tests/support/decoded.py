@@ -115,5 +115,4 @@ RAW = {
     "event": Event(role="plant", kind="started", text="x").encode(),
     "loss": Loss(key="k", count=1, reason="cache").encode(),
     "trace": batch("plant", [(NOW, Sent.FRAME, measurement(0, 0, 0, 0, 0, 0))]),
-}
-"""A message of every topic that is decoded."""
+}  # a message of every topic that is decoded

@@ -24,10 +24,8 @@ from tests.support.namespaces import RECOVERY_S, STOP_WAIT_S, Hosts, Ways
 from tests.support.zenoh_network import eventually
 
 Kind = Literal["peers", "router"]
-HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")
-"""In the order of their addresses."""
-AWAY_S: Final = 2.0
-"""Twice the lease, so that links are given up [s]."""
+HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")  # in the order of their addresses
+AWAY_S: Final = 2.0  # twice the lease, so that links are given up [s]
 
 
 class Outcome(NamedTuple):

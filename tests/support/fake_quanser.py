@@ -36,8 +36,7 @@ Kind = Literal["analog", "digital"]
 _OUTPUTS: Final[dict[Kind, tuple[range, Any, Any, float, float]]] = {
     "analog": (range(2), np.float64, np.float64, -24.0, 24.0),  # voltages of the motors [V]
     "digital": (range(2), np.int8, np.int32, 0, 1),  # amplifiers of the motors
-}
-"""Channels, types of the values written and of those at expiry, least and largest value."""
+}  # channels, types of the values written and of those at expiry, least and largest value
 
 
 class MisuseError(AssertionError):

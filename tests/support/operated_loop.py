@@ -35,14 +35,12 @@ PERIOD = 0.002
 LAW = AdaptiveSettings()
 LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
 SWING = Sinusoid(amplitude=(0.0, 5.0, 20.0), frequency=(0.0, 0.5, 0.4))
-CONFIGURED = ControllerSettings(after_restart="configured")
-"""Which session begins with what: test_session_start.py."""
+CONFIGURED = ControllerSettings(after_restart="configured")  # which session begins with what: test_session_start.py
 WIRE = WireSpec(
     attitude=SignalSpec(bits=None, limit=1.0),
     rate=SignalSpec(bits=None, limit=5.0),
     voltage=SignalSpec(bits=None, limit=1e9),
-)
-"""Unquantized and hardly limited: a command says the last bit of what the law computes."""
+)  # unquantized and hardly limited: a command says the last bit of what the law computes
 AT_REST = [0.0] * 6
 M = TypeVar("M", bound=Message)
 

@@ -6,7 +6,6 @@ one without gain and state, and one with a known optimum, for searches of gains.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Final
 
@@ -84,42 +83,12 @@ def cycle() -> Node:
     return node
 
 
-class Cyclic(Python):
-    """Makes ten objects a tick that refer to one another, and keeps those of the last second for as long."""
-
-    kept: deque[Node]
-
-    def reset(self) -> None:
-        super().reset()
-        self.state["alive"] = np.zeros(1)
-        self.kept = deque(maxlen=round(1 / self.period))
-
-    def step(self, now: Now[Floats]) -> Floats:
-        self.kept.append(cycle())
-        for _ in range(4):
-            cycle()
-        self.state["alive"] = np.array([float(Node.alive)])
-        return super().step(now)
-
-
 class Bare(ExpressionLaw[LawSettings]):
     Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         first = 3 - self.actuators
         return -15 * now.attitude_error[first + 1 :] - 6 * now.rate_error[first:], {}
-
-
-class BarePython(PythonLaw[LawSettings]):
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        pass
-
-    def step(self, now: Now[Floats]) -> Floats:
-        first = 3 - self.actuators
-        u: Floats = -15 * now.attitude_error[first + 1 :] - 6 * now.rate_error[first:]
-        return u
 
 
 class OffsetSettings(LawSettings):

@@ -18,8 +18,7 @@ from websockets.typing import Subprotocol
 from aeroloop.protocol.wire.attitude import Quaternion
 
 SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
-PATIENCE_S = 20.0
-"""For what comes within milliseconds on an idle machine."""
+PATIENCE_S = 20.0  # for what comes within milliseconds on an idle machine
 
 Fields = dict[int, list[Any]]
 

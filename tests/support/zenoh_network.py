@@ -14,8 +14,7 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 
-PATIENCE_S = 30.0
-"""How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""
+PATIENCE_S = 30.0  # how long to wait for what takes milliseconds: a shared machine can keep a process waiting
 
 
 def free_port() -> int:

@@ -26,8 +26,7 @@ from tests.support.numpy_twin import Array, Sinusoids
 
 EPS: Final = 2.0**-52
 NO_LIMITS = Limits(rate=1e9, tilt=pi, rolls=True)
-BENCH = Limits(rate=1.0, tilt=radians(60), rolls=False)
-"""A 2-DOF bench as configured unless stated otherwise."""
+BENCH = Limits(rate=1.0, tilt=radians(60), rolls=False)  # a 2-DOF bench as configured unless stated otherwise
 BODY = BENCH._replace(rolls=True)
 SAMPLED: Final = 1.004
 """How far a quartic can rise above the largest of its 65 even samples: 0.38 %, near the crests of the fourth Chebyshev

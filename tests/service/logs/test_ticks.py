@@ -74,7 +74,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     ("kind", "wire"),
     [
         *(("adaptive", wire) for wire in WIRES),
-        *((kind, "mixed") for kind in (EXPRESSIONS, PYTHON, "adaptive-torque", f"{HERE}:Bare", f"{HERE}:BarePython")),
+        *((kind, "mixed") for kind in (EXPRESSIONS, PYTHON, "adaptive-torque", f"{HERE}:Bare")),
     ],
 )
 def test_a_log_of_any_law_and_wire_is_computed_again_as_it_was(kind: str, wire: str, tmp_path: Path) -> None:

@@ -18,8 +18,7 @@ from aeroloop.service.report.page import page
 from aeroloop.service.review.report import Check, Line, Mark, Panel
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, with_faults
 
-PATIENCE_MS = 120_000
-"""Nothing here is about speed; a browser on a busy machine may take its time."""
+PATIENCE_MS = 120_000  # nothing here is about speed; a browser on a busy machine may take its time
 Open = Callable[[str], Page]
 
 

@@ -19,8 +19,7 @@ from aeroloop.service.review.theorem import check_theorem
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest
 
-Drawn = dict[tuple[str, str], Line]
-"""Lines by the label of their panel's axis, and their own."""
+Drawn = dict[tuple[str, str], Line]  # lines by the label of their panel's axis, and their own
 
 
 def drawn(ticks: Ticks, truths: Truths = NO_TRUTHS) -> Drawn:
