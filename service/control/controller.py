@@ -40,8 +40,6 @@ Codes = tuple[float, ...]
 
 _OF_MEASUREMENT: Final = 6  # of its outputs are kept of every measurement with valid values; all only if u is a number
 
-# ── one tick as one function ──
-
 
 def tick_function(wire: WireSpec, law: Law[Any]) -> ca.Function:
     """One tick: codes of a measurement in, codes of the command out. Raises LawError as `law_function`.
@@ -98,9 +96,6 @@ def _is_number(x: ca.SX) -> ca.SX:
 @lru_cache(maxsize=16)  # 20 ms; of a session's end and the next one's begin, and of many runs with the same law
 def _expressions_function(wire: WireSpec, law: type[ExpressionLaw[Any]], settings: str, period: float) -> ca.Function:
     return tick_function(wire, law(law.Settings.model_validate_json(settings), period, wire.actuators))
-
-
-# ── the controller ──
 
 
 def _last(name: str) -> Any:

@@ -191,9 +191,6 @@ def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -
     return target.after(t + s, np.diff(s), knots)
 
 
-# ── the reference as followed ──
-
-
 class Motion:
     """The reference as the loop evaluates it, tick by tick, from t = 0 on, and `trajectory`, which is followed now.
 

@@ -138,31 +138,16 @@ class Daemon:
         self._shared.claims.keep(record)
         shared.age.turn_when_due()
         refused = counts.refused + shared.changes.refused + (session.refused if session else 0)
-        self._role.status(
-            Status(
-                role=self._role.role,
-                state=state,
-                session=self._shared.claims.session,
-                cause=shared.cause if state is State.FAULTED else None,
-                uptime_s=self._role.uptime_s,
-                ticks=counts.ticks,
-                rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
-                skipped=counts.skipped,
-                received=counts.received,
-                sent=counts.sent,
-                refused=refused,
-                stale=counts.stale,
-                saturated=counts.saturated + (session.controller.saturated if session else 0),
-                age_us=shared.age.recent().summary(),
-                timing=shared.timing.report() if shared.timing else None,
-                notes=self._notes,
-                lacks_recorder=self._lacks_recorder(),
-                gains=record.gains,
-                gains_from=record.gains_from,
-                reference=in_words(record.reference),
-                reference_from=record.reference_from,
-            )
-        )
+        self._role.status(Status(
+            role=self._role.role, state=state, session=shared.claims.session,
+            cause=shared.cause if state is State.FAULTED else None, uptime_s=self._role.uptime_s,
+            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
+            skipped=counts.skipped, received=counts.received, sent=counts.sent, refused=refused, stale=counts.stale,
+            saturated=counts.saturated + (session.controller.saturated if session else 0),
+            age_us=shared.age.recent().summary(), timing=shared.timing.report() if shared.timing else None,
+            notes=self._notes, lacks_recorder=self._lacks_recorder(), gains=record.gains, gains_from=record.gains_from,
+            reference=in_words(record.reference), reference_from=record.reference_from,
+        ))  # fmt: skip
         self._status_ticks, self._status_time_s = counts.ticks, now
         self._status_due_s = self._clock.monotonic() + STATUS_PERIOD_S
 

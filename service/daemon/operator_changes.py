@@ -67,15 +67,9 @@ class OperatorChanges:
         self._present_reference: Reference = reference  # what the motion follows: of a stream, its last set-point
         self._last: SessionRecord | None = None  # this controller's own last session
         self.record = SessionRecord(
-            controller=role.name,
-            session=None,
-            gains=gains_of(settings.law),
-            gains_from="configured",
-            reference=reference,
-            reference_from="configured",
-            within_s=0.0,
-            since_tick=0,
-        )
+            controller=role.name, session=None, gains=gains_of(settings.law), gains_from="configured",
+            reference=reference, reference_from="configured", within_s=0.0, since_tick=0,
+        )  # fmt: skip
         if self._after_restart != "configured":
             self._begin_with(Hold(), "held")
 

@@ -83,14 +83,9 @@ class Session:
     """The session that `Shared.claims` has just been granted; `publish_status` publishes the status when it is due."""
 
     def __init__(
-        self,
-        role: Node,
-        settings: Settings,
-        shared: Shared,
-        controller: Controller,
-        link: ZenohLink,
+        self, role: Node, settings: Settings, shared: Shared, controller: Controller, link: ZenohLink,
         publish_status: Callable[[], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._role, self._clock, self._shared, self._link = role, role.clock, shared, link
         self._publish_status = publish_status
         self.controller = controller
@@ -260,15 +255,10 @@ class Session:
 def telemetry_of(controller: Controller, session: str) -> Telemetry:
     """The controller's last tick in a session."""
     return Telemetry(
-        session=session,
-        tick=controller.tick_index,
-        counter=controller.counter,
-        attitude_error=controller.attitude_error,
-        rate_error=controller.rate_error,
-        desired=controller.desired,
-        state=controller.law_state,
-        voltages=controller.voltages,
-    )
+        session=session, tick=controller.tick_index, counter=controller.counter,
+        attitude_error=controller.attitude_error, rate_error=controller.rate_error, desired=controller.desired,
+        state=controller.law_state, voltages=controller.voltages,
+    )  # fmt: skip
 
 
 class PlantStatus:

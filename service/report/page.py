@@ -39,27 +39,17 @@ def page(reports: Sequence[Report]) -> str:
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
     runs, drawn = [report.findings for report in reports], drawings(reports)
     return environment.get_template("page.html").render(
-        reports=reports,
-        runs=list(enumerate(reports)),
-        several=len(reports) > 1,
+        reports=reports, runs=list(enumerate(reports)), several=len(reports) > 1,
         policy=f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:",
-        style=(HERE / "page.css").read_text(encoding="utf-8"),
-        scripts=scripts,
-        data=page_data(reports, drawn),
-        drawings=drawn,
-        colours=COLOURS,
-        rows=rows.figure_rows(runs),
-        differences=differences(reports),
+        style=(HERE / "page.css").read_text(encoding="utf-8"), scripts=scripts,
+        data=page_data(reports, drawn), drawings=drawn, colours=COLOURS,
+        rows=rows.figure_rows(runs), differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),
-        missing=[rows.missing(run) for run in runs],
-        theorem=[rows.theorem_sentences(run) for run in runs],
-        durations=rows.durations(runs),
-        percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
-        verdict=verdict,
-        largest_error=largest_error,
-        thinned=max(reports, key=lambda report: report.thinned),
-    )
+        missing=[rows.missing(run) for run in runs], theorem=[rows.theorem_sentences(run) for run in runs],
+        durations=rows.durations(runs), percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
+        verdict=verdict, largest_error=largest_error, thinned=max(reports, key=lambda report: report.thinned),
+    )  # fmt: skip
 
 
 def verdict(run: Findings) -> tuple[str, bool | None, str]:

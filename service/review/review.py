@@ -128,18 +128,12 @@ def read(
     if part is not None:
         reasons["duration_s"] = f"of the session only what is {_in_words(part)} was read"
     merits = figures(
-        settings.wire,
-        loop.period,
-        (ticks.k, ticks.attitude_error),
-        (judged.answered, judged.voltages),
-        watchdog_s=settings.plant.watchdog_s,
-        unsent=judged.unsent,
+        settings.wire, loop.period, (ticks.k, ticks.attitude_error), (judged.answered, judged.voltages),
+        watchdog_s=settings.plant.watchdog_s, unsent=judged.unsent, log=recording.name, trips=trips,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
-        log=recording.name,
-        trips=trips,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
         damages=[*recording.unread, *(f"malformed: {n} of {topic}" for topic, n in sorted(messages.malformed.items()))],
-    )
+    )  # fmt: skip
     controller = its.descriptions.get("controller")
     certificate = controller.certificate if controller else None
     theorem = check_theorem(settings, ticks, messages.truths, its.changes, certificate, faults=bool(faults))
@@ -147,41 +141,26 @@ def read(
     saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
     missing = [gap for gap in recording.missing if gap.vehicle == which[0]]
     started_s = ticks.wall_ns[:1] * 1e-9
+    recorded = [
+        Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
+        for (owner, one), extent in recording.extents.items()
+    ]
     findings = Findings(
         **{key: value for key, value in merits if key != "reasons"},
         reasons=merits.reasons | reasons | theorem.reasons,
-        vehicle=which[0],
-        session=which[1],
-        sessions=len(recording.sessions_of(which[0])),
-        recorded=[
-            Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
-            for (owner, one), extent in recording.extents.items()
-        ],
-        disagreements=disagreements(its.descriptions),
+        vehicle=which[0], session=which[1], sessions=len(recording.sessions_of(which[0])), recorded=recorded,
         started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
-        timing=spreads,
-        clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None,
-        age_us=age,
-        gaps=longest,
-        gap_count=gap_count,
-        saturated=saturated,
-        invalid=invalid,
-        losses=losses,
-        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
-        missing=missing,
-        unknown=its.unknown,
-        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
-        lapses=went,
-        theorem=theorem.findings,
-        marks=marks,
-        faults=faults,
-    )
+        disagreements=disagreements(its.descriptions), theorem=theorem.findings, marks=marks, faults=faults,
+        timing=spreads, clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None, age_us=age,
+        gaps=longest, gap_count=gap_count, saturated=saturated, invalid=invalid, losses=losses, lapses=went,
+        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS}, missing=missing,
+        unknown=its.unknown, unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
+    )  # fmt: skip
     path = paths[0].resolve()
     name = path.name if path.is_dir() else path.stem
     name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    return Review(
-        merits, findings, settings, ticks, theorem, messages.truths, name, _facts(recording, its, messages), part
-    )
+    facts = _facts(recording, its, messages)
+    return Review(merits, findings, settings, ticks, theorem, messages.truths, name, facts, part)
 
 
 def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:

@@ -45,8 +45,6 @@ from aeroloop.service.control.laws.interface import (
     voltages_for,
 )
 
-# ── one tuning rule ──
-
 VOLTAGE_LIMIT: Final = 24.0  # largest voltage of the Aero's supply [V]
 TUNED: Final = ("pd", "pid", "adaptive-torque", "sliding", "lqr")
 """Kinds that the tuning rule has settings for. The law without adaptation has the paper's own gains."""
@@ -116,8 +114,6 @@ _PAPER: Final = response_of(_BODY.inertia, (0.3, 0.3, 0.3), (0.15, 0.15, 0.15)) 
 DEFAULTS: Final = {kind: tuned(kind, _BODY, _PAPER) for kind in TUNED}
 _PD, _PID, _SLIDING, _LQR = (DEFAULTS[kind] for kind in ("pd", "pid", "sliding", "lqr"))
 
-# ── what they have in common ──
-
 
 class TrackingSettings(EstimateSettings):
     """Model of the plant, a damping estimate that stays, and when the nearer of two equilibria is chosen anew."""
@@ -163,9 +159,6 @@ def feedforward(p: TrackingSettings, now: Now[ca.SX]) -> ca.SX:
     return cancelled - J * (S(omega) @ desired - R_ib @ now.desired_acceleration)
 
 
-# ── PD+ ──
-
-
 class PDSettings(TrackingSettings):
     """Model of the plant and gains. The default gains are those of the tuning rule."""
 
@@ -187,9 +180,6 @@ class PD(TrackingLaw[PDSettings]):
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return -now.gains["kp"] * sign * now.attitude_error[1:4] - now.gains["kd"] * now.rate_error, {}
-
-
-# ── PID with anti-windup ──
 
 
 class PIDSettings(TrackingSettings):
@@ -240,9 +230,6 @@ class PID(TrackingLaw[PIDSettings]):
         return u, {**state, "integral": state["integral"] + share * excess / ki}
 
 
-# ── sliding mode ──
-
-
 class SlidingSettings(TrackingSettings):
     """Model of the plant, surface and layer. The defaults are those of the tuning rule."""
 
@@ -269,9 +256,6 @@ class Sliding(TrackingLaw[SlidingSettings]):
         sigma = omega_e + slope * eps_e
         along = ca.SX(p.inertia) * slope / 2 * ((eta_e * ca.SX.eye(3) + S(eps_e)) @ omega_e)  # ε̃ moves by (C.17)
         return -along - now.gains["strength"] * ca.tanh(sigma / ca.SX(p.layer)), {}
-
-
-# ── LQR ──
 
 
 class LQRSettings(TrackingSettings):
@@ -319,9 +303,6 @@ def optimal_gain(J: float, attitude_weight: float, rate_weight: float, T: float)
             gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
             return gain
     raise ValueError("law: these weights and this period have no optimal gains")
-
-
-# ── the paper's law without adaptation ──
 
 
 class NonadaptiveSettings(EstimateSettings):

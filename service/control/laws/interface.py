@@ -132,9 +132,6 @@ class PythonLaw(Law[T]):
         """The voltages before quantization [V], shape (actuators,). Sets `state` to what it is after this tick."""
 
 
-# ── the body of a law's settings ──
-
-
 def gravity_torque(p: LawSettings, q: X) -> X:
     """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,).
 

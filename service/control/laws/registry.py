@@ -173,13 +173,13 @@ def law_function(law: Law[Any]) -> ca.Function:
     states = {name: len(value) for name, value in initial_state(law).items()}
     gains = {name: len(value) for name, value in configured_gains(law).items()}
     sizes = dict(zip(_INPUTS, (4, sum(states.values()), sum(gains.values()), 3, 3, 4, 3, 3), strict=True))
-    last, state, gain, eps, omega, q_d, omega_d, omega_d_dot = (ca.SX.sym(name, n) for name, n in sizes.items())
+    given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
+    last, state, gain, eps, omega, q_d, omega_d, omega_d_dot = given.values()
     q, e, omega_e = ca.SX.sym("q", 4), ca.SX.sym("e", 4), ca.SX.sym("omega_e", 3)
     attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
     errors = ca.Function(
         "errors", [q, omega, q_d, omega_d], list(tracking_errors(q, omega, q_d, omega_d)), {"cse": True}
     )
-    given = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
     if isinstance(law, ExpressionLaw):
         now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, _split(gain, gains), _split(state, states))
         seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
@@ -188,11 +188,11 @@ def law_function(law: Law[Any]) -> ca.Function:
     else:
         of_law = ca.SX.sym("law_voltages", law.actuators), ca.SX.sym("law_state", sizes["state"])
         given |= dict(zip(("law_voltages", "law_state"), of_law, strict=True))
-    last, state, gain, eps, *motion = [given[name] for name in _INPUTS]
     with as_written():
         q = attitude(last, eps)
-        e, omega_e = errors(q, *motion[:3])
-        u, after = answer(state, q, *motion, e, omega_e, gain) if isinstance(law, ExpressionLaw) else of_law
+        e, omega_e = errors(q, omega, q_d, omega_d)
+        seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
+        u, after = answer(*seen) if isinstance(law, ExpressionLaw) else of_law
         return ca.Function(
             "law",
             [*given.values()],
