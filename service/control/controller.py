@@ -137,8 +137,7 @@ class Controller:
     voltages: tuple[float, ...] = _last("u")
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
-        self.wire = wire
-        self.period = period
+        self.wire, self.period = wire, period
         self.tick_index, self.counter, self.refused, self.invalid = -1, 0, 0, 0
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)

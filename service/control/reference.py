@@ -67,13 +67,11 @@ class Angles(NamedTuple):
         """Angular velocities [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ. Shape (n,)."""
         square = (self.rate**2).sum(axis=1)
         square -= 2 * self.rate[:, 0] * self.rate[:, 2] * np.sin(self.angle[:, 1])
-        speeds: Floats = np.sqrt(np.maximum(0.0, square))  # NaN stays NaN
-        return speeds
+        return np.asarray(np.sqrt(np.maximum(0.0, square)))  # NaN stays NaN
 
     def tilts(self) -> Floats:
         """Angles between the body's z axis and the vertical [rad]. Shape (n,)."""
-        tilts: Floats = np.arccos(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1]))
-        return tilts
+        return np.asarray(np.arccos(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1])))
 
 
 class Trajectory(NamedTuple):
@@ -166,8 +164,7 @@ class Trajectory(NamedTuple):
         jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2).reshape(-1, 3)
         swing, f = np.abs(self.amplitude[-1]) * (self.frequency[-1] > 0), self.frequency[-1]
         largest = [np.abs(part).max(axis=0) for part in (*self.samples(), jerk)]
-        peaks: Floats = np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3])
-        return peaks
+        return np.asarray(np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3]))
 
     def largest(self, value: Callable[[Angles], Floats], terms: Floats) -> float:
         """The largest of a value of the angles: of the quintics' samples, and over all phases of the sinusoid.
@@ -207,9 +204,8 @@ class Trajectory(NamedTuple):
     def fastest(self) -> float:
         """The largest angular velocity [rad/s]."""
         angle, (roll, pitch, yaw), *_ = self.peaks()
-        return self.largest(
-            Angles.speeds, np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
-        )
+        terms = np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
+        return self.largest(Angles.speeds, terms)
 
     def check(self, limits: Limits) -> None:
         """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
@@ -233,8 +229,7 @@ class Trajectory(NamedTuple):
 
 def turning(amplitude: Floats) -> Floats:
     """The degree n of cos and sin of A sin x as factors of x, in `Trajectory.largest`. Shape as given."""
-    degree: Floats = np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25))
-    return degree
+    return np.asarray(np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25)))
 
 
 def _locked(amplitude: Floats, frequency: Floats) -> Floats:
@@ -259,17 +254,10 @@ def join(here: Angles, there: Angles, length: Floats) -> Floats:
     angle = there.angle - (p + v * T + a * T * T / 2)
     rate = (there.rate - (v + a * T)) * T
     acceleration = (there.acceleration - a) * T * T
-    return np.stack(
-        [
-            p,
-            v,
-            a / 2,
-            (10 * angle - 4 * rate + acceleration / 2) / T**3,
-            (-15 * angle + 7 * rate - acceleration) / T**4,
-            (6 * angle - 3 * rate + acceleration / 2) / T**5,
-        ],
-        axis=1,
-    )
+    third = (10 * angle - 4 * rate + acceleration / 2) / T**3
+    fourth = (-15 * angle + 7 * rate - acceleration) / T**4
+    fifth = (6 * angle - 3 * rate + acceleration / 2) / T**5
+    return np.stack([p, v, a / 2, third, fourth, fifth], axis=1)
 
 
 @cache
@@ -288,14 +276,10 @@ def reference_function() -> ca.Function:
     q_d_dot = ca.jacobian(q_d, t)
     omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
     omega_d_dot = ca.jacobian(omega_d, t)
-    return ca.Function(
-        "reference",
-        [t, start, quintic, amplitude, frequency],
-        [q_d, omega_d, omega_d_dot],
-        ["t", "start", "quintic", "amplitude", "frequency"],
-        ["q_d", "omega_d", "omega_d_dot"],
-        {"cse": True},  # the derivatives repeat sines and cosines: 12 instead of 36, and the same numbers
-    )
+    inputs = {"t": t, "start": start, "quintic": quintic, "amplitude": amplitude, "frequency": frequency}
+    outputs = {"q_d": q_d, "omega_d": omega_d, "omega_d_dot": omega_d_dot}
+    # The derivatives repeat sines and cosines: with "cse" 12 instead of 36, and the same numbers.
+    return ca.Function("reference", [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True})
 
 
 def desired(reference: Reference, period: float, ticks: int) -> Floats:

@@ -124,7 +124,14 @@ def write(
 class ControllerEnd:
     """The controller and its trace, as the daemon runs them."""
 
-    def __init__(self, settings: Settings, messages: Messages, clock: Clock, session: str, run: int) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        messages: Messages,
+        clock: Clock,
+        session: str = SESSION,
+        run: int = RUNS["controller"],
+    ) -> None:
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         self.trace = TraceWriter("controller", settings.wire, run)
         self.trace.session = session

@@ -300,8 +300,7 @@ def optimal_gain(J: float, attitude_weight: float, rate_weight: float, T: float)
         W = np.linalg.inv(np.eye(2) + G @ X)
         F, G, X, last = F @ W @ F, G + F @ W @ G @ F.T, X + F.T @ X @ W @ F, X
         if np.abs(X - last).max() <= 1e-14 * np.abs(X).max():
-            gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
-            return gain
+            return np.asarray((B.T @ X @ A / (1 + B.T @ X @ B))[0])
     raise ValueError("law: these weights and this period have no optimal gains")
 
 

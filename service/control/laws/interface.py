@@ -148,7 +148,7 @@ def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
     A B of three columns serves two motors, too: they are its last two, and the first row is fictitious. Of an
     expression it is one, of numbers an array. Raises ValueError if B has no inverse, or another number of columns.
     """
-    B: Floats = check_allocation(p, actuators)
+    B = check_allocation(p, actuators)
     if not isinstance(torque, ca.SX):
         return (np.linalg.pinv(B) @ np.asarray(torque, dtype=np.float64))[-actuators:]
     if B.shape == (3, 3):

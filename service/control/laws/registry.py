@@ -67,9 +67,8 @@ def law_settings(section: LawSettings) -> LawSettings:
     law = law_class(section)
     model = getattr(law, "Settings", None)
     if not (isinstance(model, type) and issubclass(model, LawSettings)):
-        raise PluginError(
-            f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
-        )
+        why = f"has no Settings that derive from aeroloop.LawSettings{place_of(law)}"
+        raise PluginError(f"law.kind = {section.kind!r} {why}")
     return section if isinstance(section, model) else _valid(model, section.model_dump())
 
 
@@ -126,9 +125,7 @@ def naming(kind: str, called: Any) -> Iterator[None]:
 
 def words_of(kind: str, error: Exception, called: Any) -> str:
     """What a law of this kind raised in one line, with file and line of a user's: there, or where `called` begins."""
-    if kind in BUILT_IN:
-        return str(error)
-    return f"law {kind}: {exception_line(error, called)}"
+    return str(error) if kind in BUILT_IN else f"law {kind}: {exception_line(error, called)}"
 
 
 def no_number(law: Law[Any]) -> str:
@@ -177,9 +174,8 @@ def law_function(law: Law[Any]) -> ca.Function:
     last, state, gain, eps, omega, q_d, omega_d, omega_d_dot = given.values()
     q, e, omega_e = ca.SX.sym("q", 4), ca.SX.sym("e", 4), ca.SX.sym("omega_e", 3)
     attitude = ca.Function("attitude", [last, eps], [received(eps, last)])
-    errors = ca.Function(
-        "errors", [q, omega, q_d, omega_d], list(tracking_errors(q, omega, q_d, omega_d)), {"cse": True}
-    )
+    moving = [q, omega, q_d, omega_d]
+    errors = ca.Function("errors", moving, list(tracking_errors(*moving)), {"cse": True})
     if isinstance(law, ExpressionLaw):
         now = Now(q, omega, q_d, omega_d, omega_d_dot, e, omega_e, _split(gain, gains), _split(state, states))
         seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
@@ -193,14 +189,9 @@ def law_function(law: Law[Any]) -> ca.Function:
         e, omega_e = errors(q, omega, q_d, omega_d)
         seen = [state, q, omega, q_d, omega_d, omega_d_dot, e, omega_e, gain]
         u, after = answer(*seen) if isinstance(law, ExpressionLaw) else of_law
-        return ca.Function(
-            "law",
-            [*given.values()],
-            [q, u, after, e[0], e[1:4], omega_e],
-            [*given],
-            ["q", "u", "state_next", "eta_e", "eps_e", "omega_e"],
-            {"cse": True},  # the parts overlap, and a law may compute the errors once more, as the paper has them
-        )
+        found = {"q": q, "u": u, "state_next": after, "eta_e": e[0], "eps_e": e[1:4], "omega_e": omega_e}
+        # The parts overlap, and a law may compute the errors once more, as the paper has them.
+        return ca.Function("law", [*given.values()], [*found.values()], [*given], [*found], {"cse": True})
 
 
 def _answer(law: ExpressionLaw[Any], now: Now[ca.SX], first: Mapping[str, int]) -> list[ca.SX]:
