@@ -26,12 +26,11 @@ class Failing(PythonLaw[FailingSettings]):
     Settings = FailingSettings
 
     def reset(self) -> None:
-        self.state = {"ticks": np.zeros(1)}
+        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
 
     def step(self, now: Now[Floats]) -> Any:
-        del now
-        k = int(self.state["ticks"][0])
-        self.state["ticks"] += 1
+        k = int(now.state["ticks"][0])
+        self.state["ticks"] = now.state["ticks"] + 1
         if k != self.settings.at:
             return [1.0] * self.actuators
         match self.settings.failure:
