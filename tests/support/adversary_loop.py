@@ -59,34 +59,28 @@ def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
 
 def cross(a: Array, b: Array) -> Array:
     (x, y, z), (u, v, w) = ((each[..., 0], each[..., 1], each[..., 2]) for each in (a, b))
-    found: Array = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
-    return found
+    return np.asarray(np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1))
 
 
 def dot(a: Array, b: Array) -> Array:
-    product: Array = (a * b).sum(axis=-1, keepdims=True)
-    return product
+    return np.asarray((a * b).sum(axis=-1, keepdims=True))
 
 
 def norm(v: Array) -> Array:
-    length: Array = np.sqrt((v * v).sum(axis=-1))
-    return length
+    return np.asarray(np.sqrt((v * v).sum(axis=-1)))
 
 
 def unit(v: Array) -> Array:
-    direction: Array = v / np.maximum(norm(v)[..., None], 1e-300)
-    return direction
+    return np.asarray(v / np.maximum(norm(v)[..., None], 1e-300))
 
 
 def by(matrix: Array, v: Array) -> Array:
-    product: Array = np.einsum("rij,rj->ri", matrix, v)
-    return product
+    return np.asarray(np.einsum("rij,rj->ri", matrix, v))
 
 
 def to_body(q: Array, v: Array) -> Array:
     t = 2 * cross(q[..., 1:], v)
-    found: Array = v - q[..., :1] * t + cross(q[..., 1:], t)
-    return found
+    return np.asarray(v - q[..., :1] * t + cross(q[..., 1:], t))
 
 
 def times(p: Array, q: Array) -> Array:
@@ -138,13 +132,11 @@ def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
     passed, outward = (dot(moved, moved) - c.radius**2) / (outer**2 - c.radius**2), dot(moved, tau)
     along = c.Gamma * moved / np.maximum(dot(moved, c.Gamma * moved), 1e-300)
     moved = moved + c.T * (tau - (passed > 0) * (outward > 0) * np.minimum(passed, 1) * outward * along)
-    after: Array = c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300))
-    return after
+    return np.asarray(c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300)))
 
 
 def rotor_lag(c: Any, V: Array, u: Array) -> Array:
-    lag: Array = np.where((u - V) * V >= 0, c.up, c.down)
-    return lag
+    return np.asarray(np.where((u - V) * V >= 0, c.up, c.down))
 
 
 def held_axis(q: Array) -> Array:

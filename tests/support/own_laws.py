@@ -60,8 +60,7 @@ class Python(PythonLaw[PDSettings]):
         error, rate = self.state["sign"] * e[first + 1 :], now.rate_error[first:]
         self.state["sum"] = self.state["sum"] + self.period * error
         kp, kd, ki = (now.gains[name] for name in self.gains)
-        u: Floats = -(kp * error) - kd[first:] * rate - ki * self.state["sum"]
-        return u
+        return np.asarray(-(kp * error) - kd[first:] * rate - ki * self.state["sum"])
 
 
 class Node:

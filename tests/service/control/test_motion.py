@@ -277,8 +277,7 @@ def stopping(state: Angles) -> Array:
     rate, acceleration = np.abs(state.rate[0]), np.abs(state.acceleration[0])
     brake_s = 1.5 * rate / (np.maximum(1.0, acceleration) - acceleration / 3)
     brake_s = np.where(acceleration > 0, np.maximum(brake_s, 0.1), brake_s) + 0.001  # whole milliseconds
-    distance: Array = rate * brake_s / 2 + acceleration * brake_s**2 / 12
-    return distance
+    return np.asarray(rate * brake_s / 2 + acceleration * brake_s**2 / 12)
 
 
 @settings(max_examples=60)
