@@ -43,8 +43,8 @@ RUNS: Final[dict[End, int]] = {"plant": 0x1111, "controller": 0x2222}
 Changes = dict[int, tuple[Gains | None, Reference | None]]
 
 
-def lockstep() -> Settings:
-    return load(overrides=["loop.lockstep=true"])
+def lockstep(*overrides: str) -> Settings:
+    return load(overrides=["loop.lockstep=true", *overrides])
 
 
 class Clock:

@@ -22,17 +22,13 @@ from aeroloop.service.review.theorem import TheoremCheck, check_theorem, judged_
 from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
+from tests.support.certified import FREE, bits
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
 from tests.support.ideal import IDEAL
-from tests.support.made_log import SESSION, START_NS, description, make_log
+from tests.support.made_log import SESSION, START_NS, description, lockstep, make_log
 
 TICKS = 4000
-CERTIFIED = (
-    "plant.kind=rigid_body", *IDEAL, "plant.rigid_body.damping=[0.006, 0.005, 0.007]", "wire.actuators=3",
-    "law.damping_bound=0.0119", "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]",
-    "law.centre_of_mass=[0, 0, 0]", *(f"wire.{name}.bits=12" for name in ("attitude", "rate", "voltage")),
-)  # fmt: skip
-"""A free body for which the certificate holds."""
+CERTIFIED = (*FREE, *bits(12, 12), "plant.rigid_body.damping=[0.006, 0.005, 0.007]")
 
 
 def settled(*overrides: str) -> Settings:
@@ -42,10 +38,6 @@ def settled(*overrides: str) -> Settings:
     rate = [radians(a) * f for a, f in zip(reference.amplitude, reference.frequency, strict=True)]
     begins = f"plant.rigid_body.rate={rate}", "law.damping_estimate=[0.006, 0.005, 0.007]"
     return load(overrides=[*CERTIFIED, *begins, *overrides])
-
-
-def lockstep(*overrides: str) -> Settings:
-    return load(overrides=["loop.lockstep=true", *overrides])
 
 
 @pytest.fixture(scope="module")
