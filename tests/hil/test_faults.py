@@ -38,9 +38,6 @@ def events(log: HilLog, *kinds: str) -> list[tuple[int, Event]]:
     return [(at, event) for at, event in log.messages(Event) if event.kind in kinds]
 
 
-# ── processes that die, stand still and come back ──
-
-
 @pytest.mark.smoke
 @pytest.mark.parametrize("transmit", ["periodic", "on_change"])
 def test_when_the_controller_is_killed_the_motors_rest_in_time_and_a_new_one_takes_over(
@@ -103,9 +100,6 @@ def test_a_plant_that_stood_still_ends_the_old_session_before_anything_else(hil:
     truths = [(at, truth) for at, truth in log.messages(Truth) if at > lost]
     # One tick at the most: the one that it was waiting for when it was stopped.
     assert sum(any(truth.voltages) for at, truth in truths if at < ended) <= 1
-
-
-# ── strangers ──
 
 
 @pytest.mark.smoke

@@ -1,7 +1,8 @@
 """A second closed loop in NumPy, of many configurations at once, whose errors an adversary chooses.
 
-It takes numbers from a configuration, and nothing else of the project: body (C.1), (C.2), free or with a held roll; the
-paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag; commands that are held, late or lost.
+It takes numbers from a configuration and the reference from the twin, and nothing else of the project: body (C.1),
+(C.2), free or with a held roll; the paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag;
+commands that are held, late or lost.
 
 At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the direction of τ_d and one of the commands that
 may be in force: each the one that pushes most along a costate of the linear error equations. Beside these it chooses θ,
@@ -21,6 +22,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
+
+from tests.support.numpy_twin import attitude_of, motion_of
 
 Array = npt.NDArray[np.float64]
 Motion = tuple[Array, ...]  # q_d, and ω_d and its derivative in the desired body frame
@@ -88,21 +91,10 @@ def times(p: Array, q: Array) -> Array:
     return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
 
 
-def attitude_of(angle: Array) -> Array:
-    """q of roll, pitch and yaw, of which yaw turns first."""
-    (a, b, c), (r, p, y) = np.cos(angle / 2).T, np.sin(angle / 2).T
-    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
-
-
 def desired(c: Any, t: Array) -> Motion:
     turn = c.frequency * t[:, None]
     angle, rate = c.amplitude * np.sin(turn), c.amplitude * c.frequency * np.cos(turn)
-    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = angle.T, rate.T, (-(c.frequency**2) * angle).T
-    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
-    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
-    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=1)
-    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[:, 2], across_dot * cr - ddp * sr - dr * omega[:, 1]
-    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=1)
+    return motion_of(angle, rate, -(c.frequency**2) * angle)
 
 
 def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:

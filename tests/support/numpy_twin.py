@@ -104,6 +104,22 @@ def projected(p: Body, theta: Array, tau: Array) -> Array:
     return tau - removed
 
 
+def motion_of(angle: Array, rate: Array, acceleration: Array) -> tuple[Array, Array, Array]:
+    """q_d of roll, pitch and yaw, of which yaw turns first, and ω_d and ω̇_d in the desired body frame. (…, 3)."""
+    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = (np.moveaxis(each, -1, 0) for each in (angle, rate, acceleration))
+    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
+    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
+    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=-1)
+    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[..., 2], across_dot * cr - ddp * sr - dr * omega[..., 1]
+    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=-1)
+
+
+def attitude_of(angle: Array) -> Array:
+    """q of roll, pitch and yaw. Shapes (…, 3), (…, 4)."""
+    (a, b, c), (r, p, y) = (np.moveaxis(each(angle / 2), -1, 0) for each in (np.cos, np.sin))
+    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
+
+
 @dataclass(frozen=True)
 class Sinusoids:
     """amplitude · sin(frequency · t) on roll, pitch and yaw. [rad], [rad/s]."""
@@ -116,31 +132,9 @@ class Sinusoids:
         return a * np.sin(w * t), a * w * np.cos(w * t), -a * w * w * np.sin(w * t)
 
     def desired(self, t: float) -> tuple[Array, Array, Array]:
-        """q_d, ω_d and ω̇_d, the last two in the inertial frame.
-
-        The axes of the three turns, seen from the inertial frame, are: yaw z; pitch the y axis turned by the yaw;
-        roll the x axis turned by yaw and pitch. ω_d is the sum of each rate times its axis, ω̇_d its derivative.
-        """
-        (r, p, y), (dr, dp, dy), (ddr, ddp, ddy) = self.angles(t)
-        a, b, c = r / 2, p / 2, y / 2
-        q_d = np.array(
-            [
-                np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c),
-                np.sin(a) * np.cos(b) * np.cos(c) - np.cos(a) * np.sin(b) * np.sin(c),
-                np.cos(a) * np.sin(b) * np.cos(c) + np.sin(a) * np.cos(b) * np.sin(c),
-                np.cos(a) * np.cos(b) * np.sin(c) - np.sin(a) * np.sin(b) * np.cos(c),
-            ]
-        )
-        sp, cp, sy, cy = np.sin(p), np.cos(p), np.sin(y), np.cos(y)
-        omega_d = np.array([-sy * dp + cy * cp * dr, cy * dp + sy * cp * dr, dy - sp * dr])
-        omega_d_dot = np.array(
-            [
-                -cy * dy * dp - sy * ddp - (sy * dy * cp + cy * sp * dp) * dr + cy * cp * ddr,
-                -sy * dy * dp + cy * ddp + (cy * dy * cp - sy * sp * dp) * dr + sy * cp * ddr,
-                ddy - cp * dp * dr - sp * ddr,
-            ]
-        )
-        return q_d, omega_d, omega_d_dot
+        """q_d, ω_d and ω̇_d, the last two in the inertial frame."""
+        q_d, omega, omega_dot = motion_of(*self.angles(t))
+        return q_d, rotation(q_d) @ omega, rotation(q_d) @ omega_dot
 
 
 @dataclass

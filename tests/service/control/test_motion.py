@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
 from aeroloop.service.control.motion import LEAST_TURN_S, Approach, Motion, approached, at_rest, shortest, to_set_point
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
-from tests.support.numpy_twin import Array, Sinusoids
+from tests.support.numpy_twin import Array, attitude_of, motion_of, rotation
 
 EPS: Final = 2.0**-52
 NO_LIMITS = Limits(rate=1e9, tilt=pi, rolls=True)
@@ -31,8 +31,6 @@ BODY = BENCH._replace(rolls=True)
 SAMPLED: Final = 1.004
 """How far a quartic can rise above the largest of its 65 even samples: 0.38 %, near the crests of the fourth Chebyshev
 polynomial. The rate along the direction that is fastest at any time is such a quartic."""
-
-# ── what can be asked, and from where ──
 
 
 def triples(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
@@ -94,9 +92,6 @@ def of_axis(axis: int, *state: float) -> Angles:
     return Angles(*(np.eye(3)[axis][None] * x for x in state))
 
 
-# ── a second opinion of a trajectory ──
-
-
 def states(trajectory: Trajectory, t: float) -> tuple[Array, Array, Array]:
     """Angle, rate, acceleration, each of shape (3,), term by term; on a join, of the piece after it."""
     return piece_states(trajectory, max(0, sum(start <= t for start in trajectory.starts) - 1), t)
@@ -122,15 +117,13 @@ def way(trajectory: Trajectory, target: Trajectory, end: float) -> Angles:
 
 
 def desired_of(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    class Now(Sinusoids):
-        def angles(self, _t: float) -> tuple[Array, Array, Array]:
-            return state
-
-    return Now(np.zeros(3), np.zeros(3)).desired(0.0)
+    """The twin's q_d, ω_d, ω̇_d, of which the latter two are inertial."""
+    q_d, omega, omega_dot = motion_of(*state)
+    return q_d, rotation(q_d) @ omega, rotation(q_d) @ omega_dot
 
 
 def quaternion(degrees: Sequence[float]) -> Array:
-    return desired_of((np.radians(degrees), np.zeros(3), np.zeros(3)))[0]
+    return attitude_of(np.radians(degrees))
 
 
 def terms(trajectory: Trajectory, i: int, t: float, order: int) -> float:
@@ -178,9 +171,6 @@ class Followed:
         return followed, t
 
 
-# ── it does not jump ──
-
-
 @settings(max_examples=40)
 @given(start=any_states(), reference=allowed, longer_s=seconds(0, 60), t=seconds(0, 20), at_once=st.booleans())
 def test_neither_angle_nor_rate_nor_acceleration_jumps_in_an_approach_or_between_points(
@@ -202,9 +192,6 @@ def test_neither_angle_nor_rate_nor_acceleration_jumps_in_an_approach_or_between
     for before, after in sides:
         for order in range(3):
             assert np.abs(before[order] - after[order]).max() <= tolerance[order]
-
-
-# ── it arrives ──
 
 
 @settings(max_examples=40)
@@ -267,9 +254,6 @@ def test_the_loops_function_gives_the_trajectorys_own_angles(
             assert np.abs(got - expected).max() <= EPS * (200 * size + 4 * t * by)
         for by, got, expected in zip(of[1:], (angle, rate, acceleration), piece_states(trajectory, i, t), strict=True):
             assert np.abs(got - expected).max() <= EPS * (200 * (10 + of[1] + of[2]) + 4 * t * by)
-
-
-# ── where an approach goes ──
 
 
 def stopping(state: Angles) -> Array:
@@ -340,9 +324,6 @@ def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Re
         assert not np.any(followed.at(t + later)[1:])
 
 
-# ── how long it takes ──
-
-
 @settings(max_examples=60)
 @given(start=any_states(), reference=allowed, more=st.lists(st.integers(0, 10**6), max_size=5))
 def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_less_would_not(
@@ -381,9 +362,6 @@ def test_what_no_time_would_do_for_is_refused(start: tuple[float, float, float],
         shortest(Trajectory.of(target), at_rest(start), limits).lasting(600.0, limits)
 
 
-# ── set-points of a stream ──
-
-
 @settings(max_examples=50)
 @given(start=any_states(), target=turns.map(lambda a: Hold(attitude=a)), asked_s=seconds(0.02, 2.0))
 def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hold, asked_s: float) -> None:
@@ -398,8 +376,6 @@ def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hol
     assert np.all(ends.min(axis=0) - margin <= angles)
     assert np.all(angles <= ends.max(axis=0) + margin)
 
-
-# ── limits of a reference itself ──
 
 ROLLS = Sinusoid(amplitude=(1.0, 0.0, 0.0), frequency=(0.3, 0.0, 0.0))
 

@@ -46,9 +46,6 @@ def loop() -> Iterable[Loop]:
     loop.assert_it_runs_again()
 
 
-# Gains
-
-
 def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     given = Gains(C1=(1.0, 1.0, 1.0), Gamma=(0.5, 0.5, 0.5))
     tilted = [0.0, 0.1, 0.0, 0.0, 0.3, -0.2]
@@ -105,9 +102,6 @@ def test_without_a_session_there_is_nothing_to_change(loop: Loop) -> None:
     assert loop.changes() == [Change(session="s1", tick=0, gains=gains_with(), reference=LEVEL)]
 
 
-# References
-
-
 @pytest.mark.parametrize(
     ("reference", "ends_at", "words"),
     [
@@ -146,9 +140,6 @@ def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop
     loop.end()
     loop.begin()
     assert loop.changes()[0].reference == rest  # and there the next session begins, not at 0
-
-
-# A stream of set-points
 
 
 @pytest.fixture
@@ -260,8 +251,6 @@ def test_whatever_streams_however_quickly_the_limits_hold(
         assert change.within_s <= 60.0  # and it gets there
     loop.assert_it_runs_again()
 
-
-# The log
 
 angle = st.integers(-20, 20).map(float)
 attitudes = st.tuples(st.just(0.0), angle, angle)

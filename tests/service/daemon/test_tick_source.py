@@ -164,8 +164,6 @@ def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None
     assert [(each.tick, each.frame) for each in ticks] == list(zip([*range(44), 45], contents, strict=True))
 
 
-# Where every tick has a frame
-
 PERIODIC = WireSpec()
 
 

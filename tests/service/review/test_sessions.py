@@ -59,9 +59,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# Sessions and vehicles
-
-
 def test_the_longest_session_is_judged_unless_one_is_named_or_numbered(log: Path) -> None:
     def which(**chosen: Any) -> tuple[str, str]:
         found = read(log, **chosen).findings
@@ -100,9 +97,6 @@ def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_l
     assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
 
 
-# Runs
-
-
 def recorded(path: Path, messages: list[Logged], identity: str | None) -> Path:
     settings = load()
     write(path.with_suffix(".plain"), settings, messages)
@@ -136,9 +130,6 @@ def test_what_a_restarted_recorder_wrote_is_one_run(tmp_path: Path) -> None:
     assert len(Recording([later, *parts]).extents) == 2
 
 
-# Whose settings
-
-
 def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_findings(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,9 +148,6 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     assert execute(["log", "review", str(path)]) == 0
     out = " ".join(capfd.readouterr().out.split())
     assert f"ends disagree plant.aero.mass: controller {controller.plant.aero.mass}, plant 2.0" in out
-
-
-# Comparisons
 
 
 @pytest.fixture(scope="module")

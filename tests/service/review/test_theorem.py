@@ -62,9 +62,6 @@ def judged(path: Path) -> tuple[Findings, TheoremFindings]:
     return findings, findings.theorem
 
 
-# Lemma 1
-
-
 def test_on_the_papers_plant_every_inequality_holds_at_every_tick(ideal: Path) -> None:
     _, theorem = judged(ideal)
     saturated = theorem.outside["C.30"]  # the approach asks for more than 24 V
@@ -112,9 +109,6 @@ def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_
     assert late.outside["C.29"] > 250
 
 
-# The set
-
-
 def test_a_certified_body_stays_within_the_set_that_it_entered(certified: Path) -> None:
     findings, theorem = judged(certified)
     assert (theorem.holds, theorem.held, theorem.broken, theorem.outside["C.30"]) == (True, True, 0, 0)
@@ -160,9 +154,6 @@ def test_with_faults_at_the_plant_only_the_lemma_is_judged(tmp_path: Path) -> No
     assert findings.reasons["theorem.pointwise_share"] == "faults acted at the plant"
 
 
-# From when until when
-
-
 def change(tick: int, **parts: Any) -> Change:
     return Change(session=SESSION, tick=tick, **parts)
 
@@ -185,9 +176,6 @@ def test_a_session_is_judged_from_the_end_of_its_approach_until_the_next_change(
     changes: list[Change], span: tuple[int, float]
 ) -> None:
     assert judged_ticks(changes, 0.002) == span
-
-
-# What is promised
 
 
 def held(settings: Settings, **values: float) -> dict[str, Any]:

@@ -56,9 +56,6 @@ def measurement(wire: WireSpec, k: int, *values: float) -> bytes:
     return wire.measurement.pack(k % wire.measurement.counters, codes)
 
 
-# Which law a configuration names
-
-
 def test_a_users_law_has_its_own_settings_checked_by_its_own_model() -> None:
     found = law(EXPRESSIONS, "law.kp=7", "law.mass=2")
     assert type(found) is Expressions
@@ -154,9 +151,6 @@ def test_a_module_of_the_current_folder_is_found_and_its_faults_are_in_its_own_w
     assert "there is no module lab_not_installed here; install it" in refused("lab_needs:Lab")
 
 
-# What it gets and gives
-
-
 def test_a_law_gets_what_is_received_and_gives_what_is_sent() -> None:
     """A body that has yawed, by hand: e = (cos, 0, 0, sin) of half the angle, and the rate is that of the body."""
     one = controller(EXPRESSIONS, "law.kp=10", "law.ki=4", still=True)
@@ -215,8 +209,6 @@ def test_helpers_of_a_law_give_arrays_for_numbers_and_expressions_for_expression
             assert isinstance(helper(argument), np.ndarray)
             assert helper(argument) == pytest.approx(expected, rel=1e-12)  # of B: another way to solve
 
-
-# Where it fails
 
 WHY = {
     "raises": f"law {FAILING}:Failing: RuntimeError: the estimator diverged (failing_laws.py, line {{line}})",
