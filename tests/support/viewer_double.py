@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from websockets.sync.client import connect
@@ -100,10 +99,8 @@ class Viewer:
         self.info = json.loads(self._socket.recv(PATIENCE_S))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._connecting.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._connecting.__exit__(None, None, None)
 
     def await_topics(self, *topics: str) -> None:
         while not set(topics) <= set(self.channels):
