@@ -15,8 +15,6 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Truth
-from aeroloop.service.config import load
-from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil, HilLog
 from tests.support.processes import AEROLOOP, PATIENT
 
@@ -164,13 +162,3 @@ def test_lost_frames_are_ridden_out_and_a_stream_that_ends_trips_the_watchdog(
         hil.run(3)
         assert hil.log.trips == trips
         assert trips or hil.log.figures.z_track < 8e-4  # 7.2e-4 without faults: the start's error
-
-
-def test_faults_do_over_the_network_what_they_do_in_one_process(tmp_path: Path) -> None:
-    faults = ["rate:noise=0.1@0.5", "attitude:drop=0.1@0.5", "motors:garble=0.05@0.5"]
-    with Hil(tmp_path, lockstep=True) as hil:
-        hil.start(settings={"plant.faults": faults})
-        hil.run(2)
-        figures = hil.log.figures
-    alone = run_experiment(load(overrides=[f"plant.faults={faults}"]), figures.duration_s)
-    assert (figures.z_track, figures.u_total) == (alone.z_track, alone.u_total)
