@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aeroloop.protocol.transport.endpoint import STREAMS, Endpoint
+from aeroloop.protocol.transport.network_settings import STREAMS, Endpoint
 
 PACKAGES: Final = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
 """Packages that compute, transport or store the figures in a log."""

@@ -17,8 +17,11 @@ from __future__ import annotations
 
 import json
 import logging
+import socket
+import ssl
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from math import inf
@@ -26,11 +29,12 @@ from typing import Any, Final
 
 import zenoh
 
-from aeroloop.protocol.transport.certificate import Certificate, refusal
-from aeroloop.protocol.transport.endpoint import Endpoint, accepting
+from aeroloop.protocol.transport.certificate import AUTHORITY, Certificate
 from aeroloop.protocol.transport.network_settings import (
     PORTS,
     READER,
+    STREAMS,
+    Endpoint,
     Identity,
     NetworkError,
     NetworkSettings,
@@ -40,10 +44,11 @@ from aeroloop.protocol.transport.network_settings import (
 from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, router_config, zenoh_config
 
 log: Final = logging.getLogger("aeroloop")
-COMMAND_S: Final = 0.5
-"""How long a command waits for a process that accepts a connection to answer [s]; usual is some 10 ms."""
-DECLARED_S: Final = 0.1
-"""Declarations follow a new link within this time [s]; usual is a millisecond."""
+COMMAND_S: Final = 0.5  # how long a command waits for a process that accepts a connection to answer; usual is 10 ms
+DECLARED_S: Final = 0.1  # declarations follow a new link within this time; usual is a millisecond
+ACCEPT_S: Final = 0.25  # how long `accepting` waits for a connection
+HANDSHAKE_S: Final = 0.5  # how long a command waits for a message of a TLS handshake; usual is a millisecond
+PLAIN_S: Final = 3.0  # the same for a peer of Zenoh without TLS, which hangs up after 2 s; a halted process does not
 POLL_S: Final = 0.005
 ROUTER_AGAIN_S: Final = 0.2  # pause before a client that finds no router looks again
 ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time without a router: it may have started first
@@ -269,3 +274,54 @@ def _open(config: dict[str, Any]) -> zenoh.Session:
 def _reason(error: Exception) -> str:
     """Zenoh's message without the source locations it carries."""
     return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")
+
+
+def accepting(endpoints: Sequence[str]) -> list[str]:
+    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
+
+    def accepts(text: str) -> bool:
+        endpoint = Endpoint.parse(text)
+        if endpoint.protocol in STREAMS and endpoint.port is not None:
+            with suppress(OSError), socket.create_connection(endpoint.address, ACCEPT_S):
+                return True
+        return False
+
+    with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
+        found = pool.map(accepts, endpoints)
+        return [text for text, accepted in zip(endpoints, found, strict=True) if accepted]
+
+
+def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -> str | None:
+    """One line about why a peer at an endpoint of TLS and a process with this certificate do not link.
+
+    None if nothing speaks against it, and where no process answers. Zenoh writes the reason only into its own log. TLS
+    1.3 shows a client at once what is wrong with the server's certificate, and in an alert, after the handshake, what
+    the server has against its own.
+    """
+    endpoint = Endpoint.parse(text)
+    if endpoint.protocol != "tls":
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # as Zenoh here: names of hosts do not matter
+    remedy = f"compare the clocks and {AUTHORITY} of both hosts, or issue it anew with `aeroloop host keys issue`"
+    plain_text = f"{text} does not speak TLS: has its process a network.security.directory?"
+    link, begun = None, time.monotonic()
+    try:
+        context.load_verify_locations(certificate.file.with_name(AUTHORITY))
+        context.load_cert_chain(certificate.file, certificate.key)
+        with socket.create_connection(endpoint.address, HANDSHAKE_S) as plain:
+            plain.settimeout(wait_s)
+            begun = time.monotonic()
+            with context.wrap_socket(plain) as link:
+                link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
+    except ssl.SSLCertVerificationError as error:
+        return f"{text} is refused: its certificate: {error.verify_message}; {remedy}"
+    except (ssl.SSLEOFError, ConnectionError):  # at once: it ends, or nothing listens
+        return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
+    except ssl.SSLError as error:
+        alert = (error.reason or "").lower().replace("_", " ")
+        return f"{text} refuses {certificate.file}: {alert}; {remedy}" if "alert" in alert else plain_text
+    except OSError:  # no answer in time; files that were just replaced
+        return None
+    return None

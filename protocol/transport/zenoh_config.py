@@ -19,9 +19,8 @@ from typing import Any, Final, Literal
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ACTIONS, TOPICS, Action, Topic
 from aeroloop.protocol.transport.certificate import AUTHORITY, OF_ONE_VEHICLE, ROLES, ROUTER, Certificate, common_name
-from aeroloop.protocol.transport.endpoint import TLS, Endpoint
 from aeroloop.protocol.transport.history import PAGE_BYTES
-from aeroloop.protocol.transport.network_settings import Protected
+from aeroloop.protocol.transport.network_settings import TLS, Endpoint, Protected
 
 THREADS: Final = (
     "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "

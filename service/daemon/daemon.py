@@ -143,7 +143,6 @@ class Daemon:
         record, state = shared.changes.record, shared.machine.state
         self._shown = state, record
         self._shared.claims.keep(record)
-        shared.age.turn_when_due()
         refused = counts.refused + shared.changes.setpoints.refused + (session.refused if session else 0)
         self._role.status(
             Status(
@@ -160,7 +159,7 @@ class Daemon:
                 refused=refused,
                 stale=counts.stale,
                 saturated=counts.saturated + (session.controller.saturated if session else 0),
-                age_us=shared.age.recent().summary(),
+                age_us=shared.age.recent(),
                 timing=shared.timing.report() if shared.timing else None,
                 notes=self._notes,
                 lacks_recorder=self._lacks_recorder(),

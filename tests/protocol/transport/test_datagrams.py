@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network import FrameSession
-from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
+from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import Gathering, eventually
