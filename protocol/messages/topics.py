@@ -107,8 +107,7 @@ TOPICS: Final = {
     )
 }
 
-RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
-"""Topics published from a cache."""
+RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)  # topics published from a cache
 
 _Actions = tuple[Action, ...]
 _CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer"), ("subscribe", "query")

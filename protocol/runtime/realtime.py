@@ -20,16 +20,12 @@ from typing import Final
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import LoopSettings
 
-PRIORITY: Final = 10
-"""Of SCHED_FIFO, above all that is not real-time and below the kernel's own threads, which have 50."""
+PRIORITY: Final = 10  # of SCHED_FIFO, above all that is not real-time and below the kernel's own threads, which have 50
 _PR_SET_TIMERSLACK: Final = 29
-_MCL_ALL: Final = 1 | 2
-"""MCL_CURRENT | MCL_FUTURE."""
+_MCL_ALL: Final = 1 | 2  # MCL_CURRENT | MCL_FUTURE
 _MCL_ONFAULT: Final = 4
-_YOUNG: Final = 700
-"""New objects after which the youngest generation is collected, which takes 0.04 to 0.3 ms."""
-_COLLECTIONS: Final = 4
-"""Collections of a generation after which the next older one is collected with it."""
+_YOUNG: Final = 700  # new objects after which the youngest generation is collected, which takes 0.04 to 0.3 ms
+_COLLECTIONS: Final = 4  # collections of a generation after which the next older one is collected with it
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
 
 

@@ -30,8 +30,7 @@ MAX_NODE: Final = 127
 CLASSIC_BYTES: Final = 8
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 HEARTBEAT_S: Final = 0.1
-SILENT_S: Final = 0.5
-"""A peer from which nothing is received for this long, five heartbeats, is gone [s]."""
+SILENT_S: Final = 0.5  # a peer from which nothing is received for this long, five heartbeats, is gone [s]
 
 _STATES: Final = list(PlantState)
 _CAUSES: Final = list(TripCause)

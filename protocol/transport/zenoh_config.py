@@ -31,8 +31,7 @@ QUEUE: Final = 16  # batches that may wait to be sent on a link, per priority; t
 _QUEUES: Final = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low")
 HEADER_BYTES: Final = 65_536  # more than Zenoh adds to a payload: the key, and what goes with it
 HANDSHAKE_MS: Final = 2000  # time-out of the handshake with a program that accepts a connection and sends nothing
-LEASE_MS: Final = 1000
-"""A silent peer is disconnected after this [ms]."""
+LEASE_MS: Final = 1000  # a silent peer is disconnected after this [ms]
 PATIENT_LEASE_MS: Final = 10_000
 """The same where frames have a session of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
 LAST: Final = 0xFF

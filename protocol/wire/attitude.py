@@ -13,8 +13,7 @@ from typing import TypeAlias
 
 import casadi as ca
 
-Quaternion: TypeAlias = tuple[float, float, float, float]
-"""[η, ε₁, ε₂, ε₃], unit length."""
+Quaternion: TypeAlias = tuple[float, float, float, float]  # [η, ε₁, ε₂, ε₃], unit length
 
 Vector: TypeAlias = tuple[float, float, float]
 

@@ -25,10 +25,8 @@ from aeroloop.protocol.wire.transmit import Transmit
 
 MAX_ACTUATORS: Final = 8
 
-WATCHDOG_S: Final = 0.1
-"""0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
-FIRST_COMMAND_S: Final = 1.0
-"""How long a granted claim may wait for its first command [s]."""
+WATCHDOG_S: Final = 0.1  # 0 V after this long without a fresh command [s], unless configured; as industrial drives do
+FIRST_COMMAND_S: Final = 1.0  # how long a granted claim may wait for its first command [s]
 
 
 class SignalBits(NamedTuple):
