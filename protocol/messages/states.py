@@ -10,10 +10,8 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
-NOT_RECORDING: Final = "not recording"
-"""State of a recorder that cannot write."""
-STOPPED: Final = "stopped"
-"""State of a recorder in its last status, when it ends in order."""
+NOT_RECORDING: Final = "not recording"  # state of a recorder that cannot write
+STOPPED: Final = "stopped"  # state of a recorder in its last status, when it ends in order
 
 
 class PlantState(StrEnum):

@@ -13,7 +13,6 @@ from contextlib import suppress
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
-from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
@@ -205,14 +204,8 @@ class Node:
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
-        json = topics.TOPICS[topic].kind == "json"
-        self._publishers[topic] = CachedPublisher(
-            self.zenoh,
-            topics.key(topic, self.vehicle, role=self.role),
-            per_s,
-            lossless=lossless,
-            encoding=zenoh.Encoding.APPLICATION_JSON if json else zenoh.Encoding.ZENOH_BYTES,
-        )
+        key, json = topics.key(topic, self.vehicle, role=self.role), topics.TOPICS[topic].kind == "json"
+        self._publishers[topic] = CachedPublisher(self.zenoh, key, per_s, lossless=lossless, json=json)
 
     def publish(self, topic: str, message: Message) -> None:
         """Publish a message on one of the table's JSON topics."""
@@ -284,13 +277,10 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
             return
         where = ""
         for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
-            if reply.ok is not None:
-                with suppress(ValidationError):
-                    where = f" ({Status.model_validate_json(reply.ok.payload.to_bytes()).process})"
-    raise NetworkError(
-        f"{vehicle} has a plant already{where}; stop that one, or give this one a name of its own with "
-        "--set vehicle=NAME"
-    )
+            with suppress(MessageError):
+                where = f" ({Status.decode(reply.ok.payload.to_bytes()).process})" if reply.ok else where
+    remedy = "stop that one, or give this one a name of its own with --set vehicle=NAME"
+    raise NetworkError(f"{vehicle} has a plant already{where}; {remedy}")
 
 
 class RecorderWatch:

@@ -65,12 +65,12 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
     """Raise CanError if a frame does not fit the bus, with what to do."""
     bus, longest = ("CAN FD", FD_LENGTHS[-1]) if settings.fd else ("classic CAN", CLASSIC_BYTES)
     or_fd = "" if settings.fd else ", or set can.fd = true"
-    for name, frame, signals in (
-        ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
-        ("command", wire.command, "wire.voltage.bits"),
-    ):
-        if frame.size > longest:
-            problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
+    for name, signals in {
+        "measurement": "wire.attitude.bits and wire.rate.bits",
+        "command": "wire.voltage.bits",
+    }.items():
+        if (size := getattr(wire, name).size) > longest:
+            problem = f"a {name} frame has {size} bytes, and a {bus} frame holds {longest}"
             raise CanError(f"{problem}: lower {signals}{or_fd}")
 
 

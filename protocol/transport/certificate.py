@@ -69,7 +69,7 @@ class Certificate:
 
 
 def common_name(role: str, vehicle: str | None) -> str:
-    """Common name of a certificate of a role, of one vehicle or of every one (None)."""
+    """Common name of a role's certificate, of one vehicle or of every one (None)."""
     return role if vehicle is None else f"{role}/{vehicle}"
 
 
@@ -83,7 +83,7 @@ def read_common_name(text: str) -> tuple[str, str | None] | None:
 
 def file_of(directory: Path, role: str, vehicle: str | None) -> Path:
     """File of a role's certificate."""
-    return directory / f"{role if vehicle is None else f'{role}.{vehicle}'}.pem"
+    return directory / f"{common_name(role, vehicle).replace('/', '.')}.pem"
 
 
 def load(file: Path) -> x509.Certificate:
@@ -111,10 +111,8 @@ def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) 
     The best role comes first; `vehicle` is None if any will do. Raises CertificateError if there is none that is good.
     """
     if not (directory / AUTHORITY).is_file():
-        raise CertificateError(
-            f"{directory / AUTHORITY} is missing, without which no peer is trusted: copy it from where "
-            "`aeroloop host keys init` made it"
-        )
+        remedy = "copy it from where `aeroloop host keys init` made it"
+        raise CertificateError(f"{directory / AUTHORITY} is missing, without which no peer is trusted: {remedy}")
     for role in roles:
         files = [file_of(directory, role, each) for each in dict.fromkeys((vehicle, None))]
         files += sorted(directory.glob(f"{role}.*.pem")) if vehicle is None else []
@@ -122,10 +120,8 @@ def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) 
             if file.is_file():
                 return check(file, role, vehicle)
     option = f" --vehicle {vehicle or 'V'}" if vehicle or roles[0] in OF_ONE_VEHICLE else ""
-    raise CertificateError(
-        f"{file_of(directory, roles[0], vehicle)} is missing: issue it with "
-        f"`aeroloop host keys issue {roles[0]} NAME{option}`"
-    )
+    remedy = f"`aeroloop host keys issue {roles[0]} NAME{option}`"
+    raise CertificateError(f"{file_of(directory, roles[0], vehicle)} is missing: issue it with {remedy}")
 
 
 def check(file: Path, role: str, vehicle: str | None) -> Certificate:
@@ -155,8 +151,7 @@ def check(file: Path, role: str, vehicle: str | None) -> Certificate:
     try:
         found.x509.verify_directly_issued_by(load(file.parent / AUTHORITY))
     except (InvalidSignature, ValueError, TypeError):  # another name, another kind of key
-        problem = f"{file} was not issued by {AUTHORITY} beside it: both must be of one authority; {_ISSUE}"
-        raise CertificateError(problem) from None
+        raise CertificateError(f"{file} was not issued by {AUTHORITY} beside it; {_ISSUE}") from None
     if not begin <= now <= found.not_after:
         what = f"expired at {found.not_after:{_UTC}}" if begin < now else f"is not valid before {begin:{_UTC}}"
         raise CertificateError(f"{file} {what}, and this host's clock shows {now:{_UTC}}: set the clock, or {_AGAIN}")

@@ -1,8 +1,7 @@
 """Network settings: where a process meets the others, and which of its links become mutual TLS.
 
 An endpoint of TCP beyond loopback becomes one of TLS; on loopback it stays as it is, so `tls/127.0.0.1:7447` is mutual
-TLS on this host, too. A process uses the certificate of its role and vehicle, to connect and to listen. Names of hosts
-do not matter: what a peer may do follows from its certificate's common name alone.
+TLS on this host, too. Names of hosts do not matter: what a peer may do follows from its certificate's common name.
 """
 
 from __future__ import annotations
@@ -113,13 +112,7 @@ class Endpoint:
         return self.at_port(0).is_free
 
 
-def _endpoint(text: str) -> str:
-    if text:
-        Endpoint.parse(text)
-    return text
-
-
-EndpointText = Annotated[str, AfterValidator(_endpoint)]
+EndpointText = Annotated[str, AfterValidator(lambda text: str(Endpoint.parse(text)) if text else text)]
 
 
 class SecuritySettings(BaseModel, extra="forbid"):
@@ -201,8 +194,7 @@ class Identity(NamedTuple):
     vehicle: str | None = None
 
 
-READER: Final = Identity(("operator", "observer"))
-"""A command or a viewer, of any vehicle."""
+READER: Final = Identity(("operator", "observer"))  # a command or a viewer, of any vehicle
 
 
 class Protected(NamedTuple):
@@ -242,13 +234,10 @@ def opened(text: str, settings: NetworkSettings) -> str:
         if endpoint.is_plain and endpoint.protocol != "tcp":
             raise NetworkError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
         return str(replace(endpoint, protocol="tls")) if endpoint.is_plain else text
+    remedy = "make certificates with `aeroloop host keys`, and set network.security.directory"
     if endpoint.protocol in TLS:
-        raise NetworkError(
-            f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
-        )
+        raise NetworkError(f"{endpoint} needs certificates: {remedy}")
     if endpoint.is_plain and not settings.insecure:
-        raise NetworkError(
-            f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
-            "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"
-        )
+        problem = f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle"
+        raise NetworkError(f"{problem}: {remedy}; or set network.insecure = true on a network of your own")
     return text
