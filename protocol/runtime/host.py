@@ -19,7 +19,7 @@ PACKAGES: Final = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pyda
 """Packages that compute, transport or store the figures in a log."""
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
-_PR_SET_NAME: Final = 15
+_PR_SET_NAME: Final = 15  # prctl(2)
 _LISTENS: Final = "0A"  # state of a socket in /proc/net/tcp
 _ROLES: Final = ("plant", "controller", "recorder", "router")
 
