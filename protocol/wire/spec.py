@@ -197,7 +197,7 @@ class LoopSettings(BaseModel, extra="forbid"):
 
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
-        description="request SCHED_FIFO, locked memory, affinity, awake CPUs; strict: refuse to run without the first 3",
+        description="request SCHED_FIFO, locked memory, affinity, awake CPUs; strict: stop without the first three",
     )
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
 
