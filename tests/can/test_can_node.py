@@ -18,8 +18,7 @@ from tests.support.plant_end import COUNTERS, OFF, PERIOD_NS, WIRE, RecordingPla
 from tests.support.zenoh_network import PATIENCE_S
 
 OURS = fingerprint(WIRE, PERIOD_NS, lockstep=False)
-SLACK_S = 0.3
-"""For a test that other work on the machine keeps waiting: it must run to notice anything."""
+SLACK_S = 0.3  # for a test that other work on the machine keeps waiting: it must run to notice anything
 
 
 class Bus:
@@ -116,19 +115,6 @@ def bus(hasty_bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Bus:
     return hasty_bus
 
 
-def test_a_session_begins_when_the_other_side_reports_granted_and_counts_from_0(bus: Bus) -> None:
-    bus.await_heartbeat(PlantState.IDLE)
-    assert bus.front.link is None
-    bus.turn_for(0.05)
-    assert bus.side.take() is None, "a measurement without a session"
-    bus.begin()
-    assert bus.endpoint.state is PlantState.GRANTED
-    assert bus.front.link is not None
-    bus.await_heartbeat(PlantState.GRANTED)
-    seen = bus.counters(40)
-    assert seen == [k % COUNTERS for k in range(len(seen))]
-
-
 def test_a_command_drives_it_none_from_before_the_session_and_the_heartbeat_reports_it_at_once(bus: Bus) -> None:
     bus.turn_for(0.1)  # so that any echo could be that of a measurement, were there one
     bus.side.send(command(15, code=31))
@@ -177,7 +163,11 @@ def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
     assert bus.endpoint.trip is TripCause.HOLDER_GONE
 
 
-def test_another_number_is_another_session(bus: Bus) -> None:
+def test_a_session_begins_with_a_number_that_is_granted_counts_from_0_and_ends_with_the_next(bus: Bus) -> None:
+    bus.await_heartbeat(PlantState.IDLE)
+    bus.turn_for(0.05)
+    assert bus.front.link is None
+    assert bus.side.take() is None, "a measurement without a session"
     bus.begin(number=3)
     bus.drive()
     bus.turn()
