@@ -18,11 +18,10 @@ from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubsc
 from aeroloop.protocol.transport.network import command_session, join, route
 from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings
 from aeroloop.service.host.operator import gather, stop
-from tests.protocol.transport.test_network import Listener, one_line, receives
+from tests.protocol.transport.test_network import Listener, receives
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
 
-SPEAKING = "controller", "aero"
 ROUTER, SPEAKER = Identity(("router",)), Identity(("controller",), "aero")
 WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role="controller-1-abcd")
 """What a controller may publish and hold, and an operator receive."""
@@ -30,7 +29,13 @@ WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role=
 
 def of(authority: Authority) -> NetworkSettings:
     """A network of clients with certificates of an authority, which are issued here."""
-    for role, vehicle in (("router", None), ("operator", None), ("recorder", None), ("plant", "aero"), SPEAKING):
+    for role, vehicle in (
+        ("router", None),
+        ("operator", None),
+        ("recorder", None),
+        ("plant", "aero"),
+        ("controller", "aero"),
+    ):
         authority.issue(role, vehicle)
     return NetworkSettings.model_validate(
         {
@@ -76,7 +81,7 @@ def test_a_client_that_starts_first_waits_for_the_router_and_a_command_names_it(
     thread.start()
     with pytest.raises(NetworkError) as caught, command_session(settings):
         pass
-    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
+    assert str(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
     assert not joined
     open_sessions.enter_context(closing(route(settings, ROUTER)))
     thread.join()
