@@ -1,7 +1,4 @@
-"""State tables of both ends, SPEC.md, sections 5 and 6.
-
-tests/plant_emulator/endpoint/test_freshness.py predicts every step of a plant end by its table.
-"""
+"""State tables of both ends, SPEC.md, sections 5 and 6."""
 
 from __future__ import annotations
 
