@@ -14,9 +14,10 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.node import Node
+from aeroloop.protocol.transport.certificate import OF_ONE_VEHICLE
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.network import command_session, join, route
-from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings
+from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, SecuritySettings
 from aeroloop.service.host.operator import gather, stop
 from tests.protocol.transport.test_network import Listener, receives
 from tests.support.certificates import Authority
@@ -29,21 +30,10 @@ WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role=
 
 def of(authority: Authority) -> NetworkSettings:
     """A network of clients with certificates of an authority, which are issued here."""
-    for role, vehicle in (
-        ("router", None),
-        ("operator", None),
-        ("recorder", None),
-        ("plant", "aero"),
-        ("controller", "aero"),
-    ):
-        authority.issue(role, vehicle)
-    return NetworkSettings.model_validate(
-        {
-            "mode": "client",
-            "rendezvous": f"tls/127.0.0.1:{free_port()}",
-            "security": {"directory": str(authority.folder), "vehicles": ["aero"]},
-        }
-    )
+    for role in ("router", "operator", "recorder", "plant", "controller"):
+        authority.issue(role, "aero" if role in OF_ONE_VEHICLE else None)
+    security = SecuritySettings(directory=str(authority.folder), vehicles=["aero"])
+    return NetworkSettings(mode="client", rendezvous=[f"tls/127.0.0.1:{free_port()}"], security=security)
 
 
 @pytest.fixture(params=["tcp", "tls"])
