@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 import zenoh
@@ -112,12 +113,8 @@ class Ends:
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    with Gathering() as gathering:
-        ends = Ends(gathering)
-        try:
-            yield ends
-        finally:
-            ends.close()
+    with Gathering() as gathering, closing(Ends(gathering)) as ends:
+        yield ends
 
 
 def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from math import isinf
 from threading import Event, Thread
 from typing import Any
@@ -128,9 +129,8 @@ UNSENT = 20
 def flawed(flaws: Flaws) -> Iterator[tuple[CanLink, CanSettings]]:
     del flaws
     bus = virtual()
-    link = CanLink(bus, PAPER, "plant")
-    yield link, bus
-    link.close()
+    with closing(CanLink(bus, PAPER, "plant")) as link:
+        yield link, bus
 
 
 def fill(flaws: Flaws, link: CanLink, frames: int) -> None:
@@ -226,8 +226,7 @@ def test_in_lockstep_every_frame_over_a_bus_is_that_of_the_loop_without_one(
         command = law.tick(measurements[-1], k)
 
     far, law = node(), controller()
-    front = CanNetwork(bus, loop, far.endpoint)
-    link = CanLink(bus, settings.wire, "controller", lockstep=True)
+    front, link = CanNetwork(bus, loop, far.endpoint), CanLink(bus, settings.wire, "controller", lockstep=True)
     granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(settings.wire, loop.period_ns, lockstep=True))
 
     def beat() -> None:
@@ -254,17 +253,9 @@ def test_in_lockstep_every_frame_over_a_bus_is_that_of_the_loop_without_one(
 def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_silence_sends(
     wire: WireSpec, lockstep: bool
 ) -> None:
-    bus = virtual()
-    link = CanLink(bus, wire, "plant", lockstep=lockstep)
-    try:
-        with Stranger(bus) as stranger:
-            frame = bytes(wire.command.size)
-            stranger.say(COMMAND_ID + 1, frame)
-            stranger.say(COMMAND_ID + 1, UNCHANGED)
-            stranger.settle(link)
-            arrival = link.take()
-            assert arrival is not None
-            expected = lockstep and wire == BOTH
-            assert (arrival.frame, link.refused) == ((UNCHANGED, 0) if expected else (frame, 1))
-    finally:
-        link.close()
+    bus, frame = virtual(), bytes(wire.command.size)
+    with closing(CanLink(bus, wire, "plant", lockstep=lockstep)) as link, Stranger(bus) as stranger:
+        stranger.say(COMMAND_ID + 1, frame)
+        stranger.say(COMMAND_ID + 1, UNCHANGED)
+        stranger.settle(link)
+        assert (received(link), link.refused) == ((UNCHANGED, 0) if lockstep and wire == BOTH else (frame, 1))
