@@ -41,30 +41,20 @@ def cells(line: str) -> Row:
     return tuple(cell.strip().strip("`").strip() for cell in line.strip().strip("|").split("|"))
 
 
-def rows(header: str, under: str) -> list[Row]:
-    """Rows of every table with exactly this header below a heading that contains `under`."""
-    found: list[Row] = []
-    heading, inside, fenced = "", False, False
-    for line in SPEC.splitlines():
-        if line.startswith("```"):
-            fenced = not fenced
-        elif line.startswith("#") and not fenced:
-            heading, inside = line, False
-        elif line == header and under in heading:
-            inside = True
-        elif not line.startswith("|"):
-            inside = False
-        elif inside and not set(line) <= set("|-: "):
-            found.append(cells(line))
+def rows(header: str) -> list[Row]:
+    """Rows of every table whose header begins so."""
+    lines, found = SPEC.splitlines(), list[Row]()
+    for start in (i for i, line in enumerate(lines) if line.startswith(header)):
+        found += [cells(line) for line in takewhile(lambda line: line.startswith("|"), lines[start + 2 :])]
     return found
 
 
-QUANTIZER_ROWS: Final = rows(QUANTIZER, "Golden vectors")
-KIND_ROWS: Final = rows(KINDS, "Golden vectors")
-FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
-REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
-SENT_ROWS: Final = rows(SENT, "Golden vectors")
-PUBLISHED_ROWS: Final = rows(PUBLISHED, "Topics")
+QUANTIZER_ROWS: Final = rows(QUANTIZER)
+KIND_ROWS: Final = rows(KINDS)
+FRAME_ROWS: Final = rows(FRAMES)
+REFUSED_ROWS: Final = rows(REFUSED)
+SENT_ROWS: Final = rows(SENT)
+PUBLISHED_ROWS: Final = rows(PUBLISHED)
 
 
 def number(text: str) -> int:
@@ -166,13 +156,6 @@ def test_queries_pages_and_attachments_are_their_golden_vectors(row: Row) -> Non
     assert (asked if what == "query" else page(asked, publisher, kept)) == data
 
 
-def below(header: str) -> list[Row]:
-    """Rows of the first table whose header begins so."""
-    lines = SPEC.splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith(header)) + 2
-    return [cells(line) for line in takewhile(lambda line: line.startswith("|"), lines[start:])]
-
-
 def longest(topic: Topic) -> int:
     """Most bytes of a request or its answer, or of what is published."""
     return max(topic.request, topic.limit) if topic.kind == "query" else topic.limit
@@ -191,7 +174,7 @@ def roles(cell: str) -> set[str]:
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:
-    table = {row[0]: (row[1], roles(row[3]), roles(row[4]), row[6]) for row in below("| topic | ")}
+    table = {row[0]: (row[1], roles(row[3]), roles(row[4]), row[6]) for row in rows("| topic | ")}
     assert table == {
         one.name: (one.key, {*one.senders}, {*one.receivers}, "–" if one.kind == "token" else size(longest(one)))
         for one in TOPICS.values()
@@ -200,7 +183,7 @@ def test_the_table_of_topics_is_that_of_the_code() -> None:
 
 @pytest.mark.parametrize(("end", "table"), [("plant", PLANT_TABLE), ("controller", CONTROLLER_TABLE)])
 def test_the_tables_of_states_are_those_of_the_code(end: str, table: Mapping[tuple[StrEnum, StrEnum], StrEnum]) -> None:
-    documented = below(f"| {end} is | what happens | {end} is then |")
+    documented = rows(f"| {end} is | what happens | {end} is then |")
     assert documented == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
 
 
