@@ -149,7 +149,7 @@ _WIDE: Final = dict.fromkeys(("answered", "sent", "received"), "<i8")
 
 
 @lru_cache(maxsize=16)
-def row_dtype(end: End, measurement: int, command: int, actuators: int, *, added: bool = False) -> np.dtype[np.void]:
+def row_dtype(end: End, actuators: int, measurement: int, command: int, *, added: bool = False) -> np.dtype[np.void]:
     """Fields of a row, in the order of the columns; if `added`, as it is added. Sizes of the frames in bytes."""
     columns = [(name, _WIDE.get(name, kind) if added else kind) for name, kind in _COLUMNS[end]]
     frames = [("measurement", f"V{measurement}"), ("command", f"V{command}")]
@@ -176,7 +176,7 @@ class Header(NamedTuple):
     @property
     def row_dtype(self) -> np.dtype[np.void]:
         """Fields of the rows."""
-        return row_dtype(self.end, self.measurement_bytes, self.command_bytes, self.actuators)
+        return row_dtype(self.end, self.actuators, self.measurement_bytes, self.command_bytes)
 
 
 class Batch(NamedTuple):
@@ -279,23 +279,12 @@ class TraceWriter:
             parts.append(b'"record":' + record)
         text = b"{" + b",".join(parts) + b"}" if parts else b""
         wire = self._wire
-        sizes = wire.measurement.size, wire.command.size
-        header = _HEADER.pack(
-            PROTOCOL_VERSION,
-            ENDS.index(self.end),
-            _FINAL if final else 0,
-            wire.actuators,
-            *sizes,
-            len(rows),
-            len(text),
-            self._run,
-            self._published,
-            base_ns,
-            wall_ns - (now_ns - base_ns),
-            self.session.encode("ascii"),
-        )
-        added = np.array(rows, row_dtype(self.end, *sizes, wire.actuators, added=True))
-        kinds = row_dtype(self.end, *sizes, wire.actuators)
+        sizes = wire.actuators, wire.measurement.size, wire.command.size
+        counts = len(rows), len(text), self._run, self._published
+        session = self.session.encode("ascii")
+        flags, wall_base_ns = _FINAL if final else 0, wall_ns - (now_ns - base_ns)
+        head = PROTOCOL_VERSION, ENDS.index(self.end), flags, *sizes, *counts, base_ns, wall_base_ns, session
+        added, kinds = np.array(rows, row_dtype(self.end, *sizes, added=True)), row_dtype(self.end, *sizes)
         columns = []
         for name in kinds.names or ():
             column = added[name]
@@ -307,7 +296,7 @@ class TraceWriter:
         self._published += len(rows)
         self._rows = []
         self.state, self.changes, self.operations = None, [], []
-        return b"".join([header, *columns, text])
+        return b"".join([_HEADER.pack(*head), *columns, text])
 
     def _due_record(self, now_ns: int) -> bytes:
         """Bring the controller's record up to date, and return the record if it is due."""

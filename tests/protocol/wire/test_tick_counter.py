@@ -14,7 +14,7 @@ PERIOD_NS = 2_000_000
 def runs(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]]]:
     """A counter's range, and measurements (tick, time of arrival) in order of arrival, on a clock with any offset.
 
-    The clock drifts by up to 1 %. Frames are dropped, ticks are skipped, frames overtake each other, and each is late by
+    The clock drifts by up to 1 %. Frames are dropped, ticks are skipped, frames overtake each other, each late by
     less than 3/4 of the counter's range, less what the clocks drift over a gap before it. One frame in every `counters`
     ticks is late by an eighth of the range at the most, so that the mark, which moves by 3 % of a period a tick against
     the true grid, is never a quarter of the range late.
