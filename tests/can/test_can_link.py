@@ -41,7 +41,7 @@ LENGTHS = [
 
 
 @pytest.mark.parametrize(("wire", "fd", "measurement", "command"), LENGTHS)
-def test_a_frame_crosses_byte_for_byte_and_is_padded_with_zeros(
+def test_a_frame_crosses_byte_for_byte_padded_with_zeros_and_no_other_length_or_pad_does(
     wire: WireSpec, fd: bool, measurement: tuple[int, int], command: tuple[int, int]
 ) -> None:
     with both_ends(virtual(fd=fd), wire) as (plant, controller, stranger):
@@ -53,6 +53,15 @@ def test_a_frame_crosses_byte_for_byte_and_is_padded_with_zeros(
                 assert (seen.is_fd, seen.bitrate_switch, seen.is_extended_id) == (length > 8, length > 8, False)
                 assert received(receiver) == payload
         assert plant.refused == controller.refused == 0
+        # Of a wrong length, or with a pad that is not zero.
+        size, length = measurement
+        wrong = [bytes(n) for n in (*range(9), 12, 16, 20, 32, 48, 64) if n < size or (n > size and length <= 8 >= n)]
+        wrong += [bytes(place) + b"\x80" + bytes(length - place - 1) for place in range(size, length)]
+        for data in wrong:
+            stranger.say(MEASUREMENT_ID + 1, data)
+        stranger.settle(controller)
+        assert controller.take() is None
+        assert controller.refused == len(wrong) > 0
 
 
 def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specification() -> None:
@@ -69,23 +78,6 @@ def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specifica
             eventually("a heartbeat", lambda link=link: link.peer is not None)  # type: ignore[misc]  # bound now
             assert link.peer is not None
             assert link.peer[:3] == (PlantState.IDLE, 0, MARK)
-
-
-@pytest.mark.parametrize(("wire", "fd", "measurement", "command"), LENGTHS)
-def test_a_frame_of_a_wrong_length_or_with_a_pad_that_is_not_zero_is_refused_and_counted(
-    wire: WireSpec, fd: bool, measurement: tuple[int, int], command: tuple[int, int]
-) -> None:
-    del command
-    size, length = measurement
-    wrong = [bytes(n) for n in (*range(9), 12, 16, 20, 32, 48, 64) if n < size or (n > size and length <= 8 >= n)]
-    wrong += [bytes(12)] if fd and length <= 8 else []
-    wrong += [bytes(place) + b"\x80" + bytes(length - place - 1) for place in range(size, length)]
-    with both_ends(virtual(fd=fd), wire) as (_, controller, stranger):
-        for data in wrong:
-            stranger.say(MEASUREMENT_ID + 1, data)
-        stranger.settle(controller)
-        assert controller.take() is None
-        assert controller.refused == len(wrong) > 0
 
 
 FRAME, BEAT = MEASUREMENT_ID + 1, PLANT_HEARTBEAT_ID + 1

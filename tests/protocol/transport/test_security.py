@@ -198,9 +198,7 @@ def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(
     nobody = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.authority.folder))})
     with pytest.raises(NetworkError, match="name them in"):
         protected(nobody, READER)
-    keys = f"network.security.directory={network.authority.folder}"
-    of_one = load_target(None, ["vehicle=falcon", keys])
-    assert of_one.network.security.vehicles == ["falcon"]
-    both = load_target(None, ["vehicle=falcon", keys, 'network.security.vehicles=["aero"]'])
+    named = ["vehicle=falcon", f"network.security.directory={network.authority.folder}"]
+    assert load_target(None, named).network.security.vehicles == ["falcon"]
+    both = load_target(None, [*named, 'network.security.vehicles=["aero"]'])
     assert both.network.security.vehicles == ["falcon", "aero"]
-    assert load_target().network.security.vehicles == []
