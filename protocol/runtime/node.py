@@ -278,7 +278,9 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
         where = ""
         for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
             with suppress(MessageError):
-                where = f" ({Status.decode(reply.ok.payload.to_bytes()).process})" if reply.ok else where
+                where = (
+                    f" ({Status.decode(reply.ok.payload.to_bytes(), extra='ignore').process})" if reply.ok else where
+                )
     remedy = "stop that one, or give this one a name of its own with --set vehicle=NAME"
     raise NetworkError(f"{vehicle} has a plant already{where}; {remedy}")
 

@@ -87,7 +87,6 @@ class Histogram:
     """Durations in bins 4.4 % wide (16 an octave, from 1 µs): memory stays bounded."""
 
     PER_OCTAVE: Final = 16
-    LONGEST_US: Final = 2.0**32 - 1  # over an hour, in the last bin
 
     def __init__(self, parts: Iterable[Histogram] = ()) -> None:
         self._bins: Counter[int] = Counter()
@@ -97,9 +96,9 @@ class Histogram:
             self.max_us = max(self.max_us, part.max_us)
 
     def add(self, nanoseconds: int) -> None:
-        """Count one duration [ns]; under 1 µs counts as 1 µs, over an hour as an hour."""
+        """Count one duration [ns]; under 1 µs counts as 1 µs."""
         us = nanoseconds * 1e-3
-        self._bins[int(log2(min(max(us, 1.0), self.LONGEST_US)) * self.PER_OCTAVE)] += 1
+        self._bins[int(log2(max(us, 1.0)) * self.PER_OCTAVE)] += 1
         self.max_us = max(self.max_us, us)
 
     def percentile(self, percent: float) -> float:

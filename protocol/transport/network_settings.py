@@ -123,7 +123,6 @@ class SecuritySettings(BaseModel, extra="forbid"):
         description="folder of this host's certificates, as `aeroloop host keys` makes it; every link beyond loopback "
         "is then mutual TLS; empty for none",
     )
-
     vehicles: list[Annotated[str, Field(pattern=f"^{NAME}$")]] = Field(
         default=[],
         description="vehicles whose peers have rights here; the configured one always, further ones for a recorder, an "

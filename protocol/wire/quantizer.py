@@ -234,15 +234,12 @@ class LogarithmicQuantizer(CodedQuantizer):
 
     def _least_growing(self) -> int:
         """m, by bisection: with a larger m the geometric intervals get shorter and the uniform ones longer."""
-        low, high = 1, self.top - 1
-        while low < high:
-            m = (low + high) // 2
+
+        def serves(m: int) -> bool:
             longest = -self.threshold * expm1(-log(self.threshold / self.deadzone) / m)
-            if longest * _ALIKE <= self._step(m):
-                high = m
-            else:
-                low = m + 1
-        return low
+            return longest * _ALIKE <= self._step(m)
+
+        return 1 + bisect_left(range(1, self.top - 1), True, key=serves)
 
     def _step(self, m: int) -> float:
         return (self.limit - self.threshold) / (self.top - m)

@@ -194,7 +194,6 @@ class LoopSettings(BaseModel, extra="forbid"):
     lockstep: bool = Field(
         default=False, description="the plant waits for each command before it steps: repeatable, as fast as possible"
     )
-
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
         description="request SCHED_FIFO, locked memory, affinity, awake CPUs; strict: stop without the first three",
