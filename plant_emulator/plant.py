@@ -124,7 +124,7 @@ class Plant(ABC):
 
 def class_of(kind: str) -> type[Plant]:
     """The class that `plant.kind` names. Raises PluginError."""
-    return plugins.find("plant.kind", kind, "aeroloop.plants", BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
+    return plugins.find("plant.kind", kind, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
 
 
 def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: float) -> OwnPlant:

@@ -167,7 +167,6 @@ class ZenohNetwork(PlantNetwork):
         endpoint, role, end = self._endpoint, self._role, self._plant_end
         now = time.monotonic()
         _, tick, then = self._published
-        self._latency.turn_when_due()
         role.status(
             Status(
                 role=role.role,
@@ -187,7 +186,7 @@ class ZenohNetwork(PlantNetwork):
                 stale=endpoint.stale,
                 saturated=end.saturated if end else 0,
                 latency_us=self._latency.total.summary(),
-                recent_latency_us=self._latency.recent().summary(),
+                recent_latency_us=self._latency.recent(),
                 timing=self.timing.report() if self.timing else None,
                 notes=[*self.notes, *([end.plant.note] if end and end.plant.note else [])],
                 lacks_recorder="gone" if self._recorder.gone else None,

@@ -14,19 +14,17 @@ STATUS_EVERY_S: Final = 1.0
 def run_plant(role: Node, settings: Settings) -> None:
     """Run the configured plant end until the role's `stop` is set: emulator, CAN bridge or Quanser board.
 
-    Raises:
-        AeroloopError: It cannot run, in one line.
-        ValueError: The configuration does not fit it, in one line.
+    Raises AeroloopError if it cannot run, ValueError if the configuration does not fit it, both in one line.
     """
     loop, wire, plant = settings.loop, settings.wire, settings.plant
     if plant.via == "can":
         from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 
         Bridge(role, loop, wire, plant, settings.can).run()
-        return
-    from aeroloop.plant_emulator.hosts import zenoh_network
+    else:
+        from aeroloop.plant_emulator.hosts import zenoh_network
 
-    zenoh_network.run_plant(role, loop, wire, plant)
+        zenoh_network.run_plant(role, loop, wire, plant)
 
 
 def run_router(role: Node) -> None:
