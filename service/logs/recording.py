@@ -6,7 +6,6 @@ messages stay in memory, until `release`.
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil, inf
@@ -14,16 +13,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcap.records import Channel, Message, Metadata
+from pydantic_core import from_json
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS, Batch, End, read_batch
+from aeroloop.protocol.messages.trace import ENDS, Batch, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
-from aeroloop.service.logs.session import Session, SessionKey, join, table_of
-from aeroloop.service.logs.trace_index import Source, TraceIndex
+from aeroloop.service.logs.session import Session, SessionKey, join
+from aeroloop.service.logs.trace_index import Entry, Source, TraceIndex, table_of
 
 Progress = Callable[[float], None]
 """Called repeatedly with the share done, 0…1."""
@@ -41,6 +41,9 @@ configured by itself: the controller's copy of `plant.mass` may differ from the 
 MESSAGES: Final = ("event", "loss", "status", "truth")
 """Topics whose messages are read beside the traces."""
 
+_Copy = tuple[Path, int, str | bytes, Address | None]
+"""A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
+
 
 class ReviewError(AeroloopError):
     """A log cannot be reviewed; one line with the reason."""
@@ -56,7 +59,7 @@ class Recording:
     Attributes:
         paths: The files, in the order of their first messages.
         metadata: Metadata that are no descriptions, by name without prefix (`aeroloop.recorder` is `recorder`).
-        extents: Recorded extent of each session, in the order of recording.
+        extents: Recorded extent of each session, in the order of publication.
         missing: Rows that the log lacks.
         unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
         messages: Messages of the topics MESSAGES with their keys, in the order of recording.
@@ -73,21 +76,23 @@ class Recording:
         self.damaged: list[str] = []
         self.malformed: Counter[str] = Counter()
         self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
-        self._begun_ns: dict[Source | tuple[SessionKey, End], int] = {}  # first publication of rows
         self._index = TraceIndex()
-        begins_ns = {path: _begin_ns(path) for path in _files(paths)}
+        begins_ns, marks, copies = dict[Path, int](), dict[Path, set[object]](), list[_Copy]()
+        try:
+            sizes, done = {path: path.stat().st_size for path in _files(paths)}, 0
+            for path, size in sizes.items():
+
+                def report(read: int, before: int = done) -> None:
+                    if progress is not None:
+                        progress(INDEXING * (before + read) / max(1, sum(sizes.values())))
+
+                begins_ns[path], marks[path] = self._read(path, report, copies)
+                done += size
+        except NotMcapError as error:
+            raise ReviewError(f"{error}, so it is no log") from None
+        except OSError as error:
+            raise ReviewError(f"cannot read {error.filename or paths[0]}: {error.strerror}") from None
         self.paths = sorted(begins_ns, key=begins_ns.__getitem__)
-        size, done = max(1, sum(path.stat().st_size for path in self.paths)), 0
-        copies = list[_Copy]()
-        marks = dict[Path, set[object]]()
-        for path in self.paths:
-
-            def report(read: int, before: int = done) -> None:
-                if progress is not None:
-                    progress(INDEXING * (before + read) / size)
-
-            marks[path] = self._read(path, report, copies)
-            done += path.stat().st_size
         _check_that_all_are_of_one_run(marks)
         self._add_descriptions(copies)
         self._index.finish()
@@ -155,10 +160,9 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
-        payloads = memoryview(self._index.payloads)
-        controller, states, left_out = table_of("controller", settings.wire, computed, payloads)
+        controller, states, left_out = table_of("controller", settings.wire, computed)
         its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
-        plant, _, more_left_out = table_of("plant", settings.wire, its, payloads)
+        plant, _, more_left_out = table_of("plant", settings.wire, its)
         self.malformed["trace"] += left_out + more_left_out
         for gap in unknown:
             plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
@@ -176,6 +180,17 @@ class Recording:
             *join(controller, plant, first, last),
         )
 
+    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
+        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
+        for source, entries in self._index.entries.items():
+            if source.end == "plant" and entries:
+                batches = [batch for entry in entries if (batch := read_batch(entry.payload)) is not None]
+                yield source, self._described_before(source.vehicle, "plant", entries), batches
+
+    def release(self) -> None:
+        """Free batches and messages, once all that is wanted of them is read: no other session can be read then."""
+        self._index, self.messages = TraceIndex(), []
+
     # ── descriptions ──
 
     @property
@@ -189,7 +204,7 @@ class Recording:
         found = {role: last for (_, role), last in known if role == "recorder"}
         found |= {role: last for (vehicle, role), last in known if vehicle == which[0]}
         for end in ENDS:
-            if its := self._described_at(which[0], end, self._begun_ns.get((which, end))):
+            if its := self._described_before(which[0], end, self._index.parts[which, end]):
                 found[end] = its
         return found
 
@@ -211,63 +226,13 @@ class Recording:
         owned = {section: getattr(its, section) for role, its in owners.items() for section in OWNED[role]}
         return from_description(config).model_copy(update=owned)  # not validated again: each role ran by its own
 
-    def _described_at(self, vehicle: str, role: str, at_ns: int | None) -> Description | None:
-        """The last description that a role published before a time [ns since 1970]; else its first."""
+    def _described_before(self, vehicle: str, role: str, entries: Sequence[Entry]) -> Description | None:
+        """The last description that a role published before these batches; else its first."""
         found = self._descriptions.get((vehicle, role))
-        if found is None or at_ns is None:
+        if found is None or not entries:
             return None
-        return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
-
-    # ── the plant's processes ──
-
-    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
-        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
-        for source, entries in self._index.entries.items():
-            if source.end == "plant" and entries:
-                payloads = (bytes(self._index.payloads[one.place]) for one in entries)
-                batches = [batch for payload in payloads if (batch := read_batch(payload)) is not None]
-                yield source, self._described_at(source.vehicle, "plant", self._begun_ns[source]), batches
-
-    def release(self) -> None:
-        """Free batches and messages, once all that is wanted of them is read: no other session can be read then."""
-        self._index, self.messages = TraceIndex(), []
-
-    # ── the look at the files ──
-
-    def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> set[object]:
-        """Read a file's metadata, descriptions and traces; returns what marks its run, nothing without a trace."""
-        addresses: dict[int, Address | None] = {}
-        marks, damages = set[object](), list[str]()
-        identity: object = path
-        for record in records(path, damages, progress):
-            match record:
-                case Channel():
-                    addresses[record.id] = topics.read_key(record.topic)
-                case Metadata(name=name, metadata=entries) if name == DESCRIPTION_METADATA:
-                    copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
-                case Metadata(name=name, metadata=entries) if name.startswith("aeroloop."):
-                    try:
-                        content = json.loads(entries.get("json", "{}"))
-                    except (ValueError, RecursionError) as error:
-                        damages.append(f"metadata {name}: {str(error).splitlines()[0]}")
-                        continue
-                    if isinstance(content, dict):
-                        self.metadata[name.removeprefix("aeroloop.")] = content
-                        if name == RECORDER_METADATA and isinstance(content.get("id"), str):
-                            identity = content["id"]
-                case Message() if (address := addresses.get(record.channel_id)) is not None:
-                    if address.topic.name == "description":
-                        copies.append((path, record.publish_time, record.data, address))
-                    elif address.topic.name == "trace" and (found := self._index.add(address.vehicle, record.data)):
-                        source, session = found
-                        which = address.vehicle, session
-                        marks |= {source, which} if session else {source}
-                        for one in (source, (which, source.end)):
-                            self._begun_ns[one] = min(self._begun_ns.get(one, record.publish_time), record.publish_time)
-                    elif address.topic.name in MESSAGES:
-                        self.messages.append((address, record))
-        self.damaged += [f"{path}: {damage}" for damage in damages]
-        return marks and {*marks, identity}
+        begun_ns = min(entry.published_ns for entry in entries)
+        return next((one for at_ns, one in reversed(found) if 0 < at_ns <= begun_ns), found[0][1])
 
     def _add_descriptions(self, copies: Sequence[_Copy]) -> None:
         """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
@@ -293,9 +258,44 @@ class Recording:
             else:
                 self.damaged.append(f"{path}: a description: {why}")
 
+    # ── files ──
 
-_Copy = tuple[Path, int, str | bytes, Address | None]
-"""A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
+    def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> tuple[int, set[object]]:
+        """Read a file's metadata, descriptions and traces.
+
+        Returns:
+            When its first message was recorded [ns since 1970], and what marks its run: nothing without a trace.
+        """
+        addresses: dict[int, Address | None] = {}
+        begin_ns, marks, damages = 0, set[object](), list[str]()
+        identity: object = path
+        for record in records(path, damages, progress):
+            match record:
+                case Channel():
+                    addresses[record.id] = topics.read_key(record.topic)
+                case Metadata(name=name, metadata=entries) if name == DESCRIPTION_METADATA:
+                    copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
+                case Metadata(name=name, metadata=entries) if name.startswith("aeroloop."):
+                    try:
+                        content = dict(from_json(entries.get("json", "{}")))
+                    except (ValueError, TypeError) as error:
+                        damages.append(f"metadata {name}: {str(error).splitlines()[0]}")
+                        continue
+                    self.metadata[name.removeprefix("aeroloop.")] = content
+                    if name == RECORDER_METADATA and isinstance(content.get("id"), str):
+                        identity = content["id"]
+                case Message(publish_time=at_ns, data=data):
+                    begin_ns = begin_ns or record.log_time
+                    if (address := addresses.get(record.channel_id)) is None:
+                        continue
+                    if address.topic.name == "description":
+                        copies.append((path, at_ns, data, address))
+                    elif address.topic.name == "trace":
+                        marks |= self._index.add(address.vehicle, data, at_ns)
+                    elif address.topic.name in MESSAGES:
+                        self.messages.append((address, record))
+        self.damaged += [f"{path}: {damage}" for damage in damages]
+        return begin_ns, marks and {*marks, identity}
 
 
 def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
@@ -303,16 +303,15 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
 
     Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
     """
-    runs: list[tuple[set[object], list[Path]]] = []
-    for path, its in marks.items():
-        if its:  # else it has no trace to be mixed with others
-            related = [run for run in runs if run[0] & its]
-            paths = [one for run in related for one in run[1]]
-            runs = [run for run in runs if run not in related]
-            runs.append((its.union(*(run[0] for run in related)), [*paths, path]))
+    left = {path: its for path, its in marks.items() if its}  # one without a trace cannot be mixed with others
+    runs: list[Path] = []
+    while left:
+        runs.append(next(iter(left)))
+        run = left.pop(runs[-1])
+        while related := [path for path, its in left.items() if its & run]:
+            run = run.union(*(left.pop(path) for path in related))
     if len(runs) > 1:
-        names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
-        some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
+        some = "; ".join(map(str, runs[:8])) + ("; …" if len(runs) > 8 else "")
         raise ReviewError(
             f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
             "`aeroloop log compare`"
@@ -321,13 +320,9 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
 
 def _read_description(text: str | bytes, address: Address | None) -> Description:
     """Parse a description, recorded under a key. Raises ValueError if it is malformed, or not what its key says."""
-    try:
-        content = json.loads(text)
-    except RecursionError:
-        raise ValueError("it is nested too deeply") from None
-    if not isinstance(content, dict):
-        raise ValueError("a description is no JSON object")
-    if (version := content.get("protocol", PROTOCOL_VERSION)) != PROTOCOL_VERSION:
+    content = from_json(text)
+    version = content.get("protocol", PROTOCOL_VERSION) if isinstance(content, dict) else PROTOCOL_VERSION
+    if version != PROTOCOL_VERSION:
         raise ValueError(f"it is of protocol version {version}; read it with the aeroloop that wrote it")
     description = Description.model_validate(content, extra="ignore")
     if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
@@ -337,16 +332,6 @@ def _read_description(text: str | bytes, address: Address | None) -> Description
     except ConfigError as error:
         raise ValueError(str(error)) from None
     return description
-
-
-def _begin_ns(path: Path) -> int:
-    """When a file's first message was recorded [ns since 1970]; 0 without any. Raises ReviewError."""
-    try:
-        return next((one.log_time for one in records(path) if isinstance(one, Message)), 0)
-    except NotMcapError as error:
-        raise ReviewError(f"{error}, so it is no log") from None
-    except OSError as error:
-        raise ReviewError(f"cannot read {path}: {error.strerror}") from None
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:

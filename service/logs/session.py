@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, nan
+from math import inf
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -13,19 +13,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import MAX_SIGNALS, Description, Truth
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import (
-    NEVER,
-    Batch,
-    End,
-    Header,
-    Outcome,
-    Received,
-    Tail,
-    read_batch,
-    read_columns,
-    row_dtype,
-)
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.messages.trace import NEVER, End, Outcome, Received
 from aeroloop.service.config import Settings
 
 Array = npt.NDArray[np.float64]
@@ -126,62 +114,6 @@ class Session:
     acted: Places
 
 
-class Entry(NamedTuple):
-    """A batch of a trace, as it was recorded."""
-
-    header: Header
-    place: slice  # where its bytes are in `TraceIndex.payloads`
-    first: int  # tick of the first row
-    last: int  # highest tick; a late row is of an earlier one
-    proof: int  # a tick of the other end whose row there must be
-    changes: list[Change]
-    record: list[Change]
-
-    @property
-    def after(self) -> int:
-        """Number of the first row after it."""
-        return self.header.first_row + self.header.rows
-
-
-def table_of(
-    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: memoryview
-) -> tuple[Table, dict[int, dict[str, Any]], int]:
-    """One end's rows, from batches in order.
-
-    Returns:
-        The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
-    """
-    sizes = wire.measurement.size, wire.command.size, wire.actuators
-    fitting = [
-        one
-        for one in entries
-        if (one.header.measurement_bytes, one.header.command_bytes, one.header.actuators) == sizes
-    ]
-    kinds = row_dtype(end, *sizes)
-    wide = {"tick", "session_tick", "answered", "received", "sent"}
-    columns = [
-        (name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or () if name != "voltages"
-    ]
-    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
-    states = dict[int, dict[str, Any]]()
-    filled, next_row = 0, -1
-    for entry in fitting:
-        header, payload = entry.header, bytes(payloads[entry.place])
-        batch = Batch(header, read_columns(header, payload), Tail())
-        if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
-            states[filled] = whole.tail.state
-        next_row = entry.after
-        rows = table[filled : filled + header.rows]
-        for name, _ in columns:
-            rows[name] = batch.columns[name]
-        rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
-        rows["wall"] = header.wall_ns - header.monotonic_ns
-        filled += header.rows
-    if end == "plant":
-        table["answered"][table["answered"] == NEVER] = NO_TICK
-    return table, states, len(entries) - len(fitting)
-
-
 def join(
     controller: Table, plant: Table, first: float = -inf, last: float = inf
 ) -> tuple[Integers, Places, Places, Places]:
@@ -212,8 +144,9 @@ class TrueStates:
 
     def __init__(self, actuators: Mapping[str, int]) -> None:
         self._actuators = actuators
-        self._states: dict[str, dict[int, tuple[float, ...]]] = {session: {} for session in actuators}
-        self._signals: dict[str, dict[str, dict[int, float]]] = {session: {} for session in actuators}
+        self._states: dict[str, dict[int, tuple[tuple[float, ...], dict[str, float | None]]]]
+        self._states = {session: {} for session in actuators}
+        self._names: dict[str, set[str]] = {session: set() for session in actuators}
 
     def add(self, data: bytes) -> None:
         """Add a message, unless it is of another session; of a tick, the first counts.
@@ -222,26 +155,23 @@ class TrueStates:
             ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
         """
         truth = Truth.model_validate_json(data)
-        if truth.session is None or truth.session not in self._actuators or (k := truth.session_tick) is None:
+        if (session := truth.session) is None or session not in self._actuators or (k := truth.session_tick) is None:
             return
-        signals = self._signals[truth.session]
-        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[truth.session]:
+        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[session]:
             raise ValueError("a true state of no tick of its session")
-        if len({*signals, *truth.signals}) > MAX_SIGNALS:
+        if len(self._names[session] | truth.signals.keys()) > MAX_SIGNALS:
             raise ValueError("more signals than a plant has")
-        self._states[truth.session].setdefault(k, (k, *truth.attitude, *truth.rate, *truth.voltages))
-        for name, value in truth.signals.items():
-            signals.setdefault(name, {}).setdefault(k, nan if value is None else value)
+        if k not in self._states[session]:
+            self._states[session][k] = (k, *truth.attitude, *truth.rate, *truth.voltages), truth.signals
+            self._names[session].update(truth.signals)
 
     def rows(self, session: str) -> Array:
         """Tick, q, ω and the motors' voltages, ascending. Shape (n, 8 + actuators)."""
-        rows = [row for _, row in sorted(self._states[session].items())]
+        rows = [row for _, (row, _) in sorted(self._states[session].items())]
         return np.array(rows, np.float64).reshape(-1, 8 + self._actuators[session])
 
     def signals(self, session: str) -> dict[str, Array]:
         """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
-        ticks = sorted(self._states[session])
-        return {
-            name: np.array([values.get(k, nan) for k in ticks])
-            for name, values in sorted(self._signals[session].items())
-        }
+        found = [signals for _, (_, signals) in sorted(self._states[session].items())]
+        names = sorted(self._names[session])
+        return {name: np.array([signals.get(name) for signals in found], np.float64) for name in names}

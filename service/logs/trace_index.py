@@ -4,9 +4,8 @@ Rows are numbered per process of an end, so a jump in the numbers is the number 
 
 The tail of a controller's batch has the changes among its rows and, once a second, the record of what is in force with
 the tick since when; the plant's batches repeat the last record that the controller sent. So a record proves what was in
-force from that tick to its own, and from a proven tick on the rows of the controller prove it up to a gap. The
-controller's state stands before each batch: after a gap its rows count from the first batch that begins with gains and
-reference known. All other ticks are unknown, and no reader computes anything of them.
+force from that tick to its own, and from a proven tick on the rows of the controller prove it up to a gap, after which
+they count from the first batch that begins with gains and reference known. No reader computes anything of other ticks.
 """
 
 from __future__ import annotations
@@ -14,14 +13,26 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import ENDS, NEVER, Batch, End, Received, read_batch
-from aeroloop.service.logs.session import NO_TICK, Entry, Extent, Integers, Missing, SessionKey, Unknown
+from aeroloop.protocol.messages.trace import (
+    ENDS,
+    NEVER,
+    Batch,
+    End,
+    Header,
+    Received,
+    Tail,
+    read_batch,
+    read_columns,
+    row_dtype,
+)
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.logs.session import NO_TICK, Extent, Integers, Missing, SessionKey, Table, Unknown
 
 _MOST: Final = 1 << 62
 """More rows than any process publishes, and more nanoseconds than any clock counts."""
@@ -38,18 +49,34 @@ class Source(NamedTuple):
     run: int
 
 
+class Entry(NamedTuple):
+    """A batch of a trace, as it was recorded."""
+
+    header: Header
+    payload: bytes
+    published_ns: int
+    first: int  # tick of the first row
+    last: int  # highest tick; a late row is of an earlier one
+    proof: int  # a tick of the other end whose row there must be
+    changes: list[Change]
+    record: list[Change]
+
+    @property
+    def after(self) -> int:
+        """Number of the first row after it."""
+        return self.header.first_row + self.header.rows
+
+
 class TraceIndex:
     """Which batches a run's traces have; after `finish`, also what they lack.
 
     Attributes:
-        extents: Recorded extent of each session, in the order of recording.
+        extents: Recorded extent of each session, in the order of publication.
         missing: Missing rows.
         changes: Changes of gains and reference of each session, in order.
         unknown: Ticks whose gains, reference or law's state the log does not hold.
         entries: Batches of each process, in the order of its rows, none twice.
         parts: Batches of each session and end, likewise.
-        payloads: All batches, one after another; see `Entry.place`. One object, as an hour is 140 MB, which many small
-            ones would not return to the system.
         malformed: Batches that are malformed, or of no process of the session.
     """
 
@@ -60,26 +87,23 @@ class TraceIndex:
         self.unknown: list[Unknown] = []
         self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)
         self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)
-        self.payloads = bytearray()
         self.malformed = 0
         self._known: set[int] = set()
 
-    def add(self, vehicle: str, payload: bytes) -> tuple[Source, str] | None:
+    def add(self, vehicle: str, payload: bytes, published_ns: int) -> set[object]:
         """Add a batch, once; returns its process and session. A malformed one is dropped and counted."""
         batch = read_batch(payload)
         if batch is None or max(batch.header.first_row, batch.header.monotonic_ns) >= _MOST:
             self.malformed += 1
-            return None
+            return set()
         header, tail = batch.header, batch.tail
-        source = Source(vehicle, header.end, header.run)
+        source, session = Source(vehicle, header.end, header.run), header.session
         if (identity := hash((source, payload))) not in self._known:
             self._known.add(identity)
-            changes = [change for change in tail.changes if change.session == header.session]
-            record = tail.record if all(change.session == header.session for change in tail.record) else []
-            place = slice(len(self.payloads), len(self.payloads) + len(payload))
-            self.payloads += payload
-            self.entries[source].append(Entry(header, place, *_ticks(batch), changes, record))
-        return source, header.session
+            changes = [change for change in tail.changes if change.session == session]
+            record = tail.record if all(change.session == session for change in tail.record) else []
+            self.entries[source].append(Entry(header, payload, published_ns, *_ticks(batch), changes, record))
+        return {source, (vehicle, session)} if session else {source}
 
     def finish(self) -> None:
         """Find sessions, and what the log lacks of them, once all batches are added."""
@@ -88,8 +112,9 @@ class TraceIndex:
             for entry in entries:
                 if entry.header.session:
                     self.parts[(source.vehicle, entry.header.session), source.end].append(entry)
-            self._find_gaps(source, [entry for entry in entries if entry.header.rows])
-        for (which, end), part in self.parts.items():
+            self._find_gaps(source, [entry for entry in entries if entry.header.rows or entry.header.final])
+        begun = sorted(self.parts.items(), key=lambda its: min(entry.published_ns for entry in its[1]))
+        for (which, end), part in begun:
             if having := [entry for entry in part if entry.header.rows]:
                 extent = self.extents.setdefault(which, Extent(*(dict.fromkeys(ENDS, n) for n in (0, NO_TICK, 0))))
                 extent.first[end] = min(entry.first for entry in having)
@@ -114,45 +139,42 @@ class TraceIndex:
         session or grants it, so batches of its name and of another process are untrusted.
         """
         rows: defaultdict[tuple[str, End, str], Counter[Source]] = defaultdict(Counter)
-        kept = dict[Source, list[Entry]]()
         for source, entries in self.entries.items():
-            kept[source], after = [], 0
+            after, kept = 0, list[Entry]()
             # one without rows precedes the batch that starts at the same row
             for entry in sorted(entries, key=lambda e: (e.header.first_row, e.header.rows > 0, e.header.monotonic_ns)):
                 if not entry.header.rows or entry.header.first_row >= after:
-                    kept[source].append(entry)
+                    kept.append(entry)
                     after = max(after, entry.after)
                     rows[source.vehicle, source.end, entry.header.session][source] += entry.header.rows
+            self.malformed += len(entries) - len(kept)
+            self.entries[source] = kept
         owners = {which: counts.most_common(1)[0][0] for which, counts in rows.items()}
-        for source, entries in kept.items():
-            its = {which[2] for which, owner in owners.items() if owner == source} | {""}
-            own = [entry for entry in entries if entry.header.session in its]
-            self.malformed += len(self.entries[source]) - len(own)
-            self.entries[source] = own
+        for source, entries in self.entries.items():
+            its = {""} | {session for (*_, session), owner in owners.items() if owner == source}
+            self.entries[source] = [entry for entry in entries if entry.header.session in its]
+            self.malformed += len(entries) - len(self.entries[source])
 
     def _find_gaps(self, source: Source, having: Sequence[Entry]) -> None:
-        """Find missing rows before each batch of a process. It numbers the rows of all its sessions."""
+        """Find missing rows between the batches of a process that have rows or end a session."""
         vehicle, end, _ = source
-        if having and (rows := min(having[0].header.first_row, having[0].first)):
+        if having and (rows := min(having[0].header.first_row, having[0].first)) > 0:
             self._lacks(vehicle, having[0].header.session, end, 0, having[0].first - 1, rows)
         for one, following in pairwise(having):
-            if not (rows := following.header.first_row - one.after):
-                continue
+            rows = following.header.first_row - one.after
             before, session = one.header.session, following.header.session
-            if before == session:
-                self._lacks(vehicle, session, end, one.last + 1, following.first - 1, rows)
-                continue
-            head = min(rows, following.first)  # of the session that begins; it has no more rows before than ticks
-            tail = rows - head  # of the one before, or of others after it, unless its end is known
-            finals = [entry for entry in self.entries[source] if entry.header.final]
-            if ends := [entry.after for entry in finals if entry.header.session == before]:
-                tail = min(tail, max(ends) - one.after)
-            if tail:
-                self._lacks(vehicle, before, end, one.last + 1, None, tail)
-            if others := rows - head - tail:
-                self._lacks(vehicle, "", end, 0, None, others)
-            if head:
-                self._lacks(vehicle, session, end, 0, following.first - 1, head)
+            if rows and before == session:
+                last = following.first - 1 if following.header.rows else None
+                self._lacks(vehicle, session, end, one.last + 1, last, rows)
+            elif rows:
+                head = min(rows, max(0, following.first))  # it has no more rows before than ticks
+                tail = 0 if one.header.final else rows - head  # of the session before, or of others after it
+                if tail:
+                    self._lacks(vehicle, before, end, one.last + 1, None, tail)
+                elif rows > head:
+                    self._lacks(vehicle, "", end, 0, None, rows - head)
+                if head:
+                    self._lacks(vehicle, session, end, 0, following.first - 1, head)
 
     def _lacks(self, vehicle: str, session: str, end: End, first: int, last: int | None, rows: int) -> None:
         lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
@@ -162,11 +184,8 @@ class TraceIndex:
         """Find a session's changes, and the ticks up to the last answered one at which they are not known."""
         entries = [entry for end in ENDS for entry in self.parts[which, end]]
         self.changes[which] = _changes(entries)
-        proven = [
-            (max(change.tick for change in entry.record), max(entry.last, *(change.tick for change in entry.record)))
-            for entry in entries
-            if _is_whole(entry.record)
-        ]
+        records = [(max(change.tick for change in one.record), one.last) for one in entries if _is_whole(one.record)]
+        proven = [(first, max(first, last)) for first, last in records]
         having = [entry for entry in self.parts[which, "controller"] if entry.header.rows]
         begun = [change for entry in entries for change in entry.changes if change.tick == 0]
         # A session whose first row is of a later tick has found no attitude to hold before.
@@ -185,10 +204,12 @@ class TraceIndex:
         begin = min(extent.first[end] for end in ENDS if extent.rows[end])
         if begin > last_tick:
             return
-        edges = _edges((begin, last_tick), [*proven, *recorded, *known])
-        unknown = ~_covered(edges, known) & (_covered(edges, recorded) | ~_covered(edges, proven))
-        turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
-        for first, last in zip(edges[turns[::2]].tolist(), edges[turns[1::2]].tolist(), strict=True):
+        turns = [turn for first, last in (*proven, *recorded, *known) for turn in (first, last + 1)]
+        edges = np.unique(np.clip([begin, *turns, last_tick + 1], begin, last_tick + 1))
+        unknown = ~_within(edges, known) & (_within(edges, recorded) | ~_within(edges, proven))
+        unknown[-1] = False
+        begins, ends = edges[np.flatnonzero(np.diff(unknown, prepend=False))].reshape(-1, 2).T.tolist()
+        for first, last in zip(begins, ends, strict=True):
             self.unknown.append(Unknown(vehicle=which[0], session=which[1], first_tick=first, last_tick=last - 1))
 
 
@@ -224,17 +245,37 @@ def _is_whole(changes: Iterable[Change]) -> bool:
     return {part for change in changes for part in _parts(change)} == {"gains", "reference"}
 
 
-def _edges(span: tuple[int, int], ranges: Ranges) -> Integers:
-    """Where any range begins or the next tick after it is, within a span and at both its edges."""
-    first, last = span
-    return np.unique(np.clip([first, last + 1, *(a for a, _ in ranges), *(b + 1 for _, b in ranges)], first, last + 1))
+def _within(ticks: Integers, ranges: Ranges) -> npt.NDArray[np.bool_]:
+    """Whether any range has each tick."""
+    firsts, lasts = np.array(ranges, np.int64).reshape(-1, 2).T
+    return np.searchsorted(np.sort(firsts), ticks, "right") > np.searchsorted(np.sort(lasts), ticks, "left")
 
 
-def _covered(edges: Integers, ranges: Ranges) -> npt.NDArray[np.bool_]:
-    """Whether any range has the ticks from each edge to the next."""
-    steps = np.zeros(len(edges) + 1, np.int64)
-    for first, last in ranges:
-        if last >= first:
-            steps[np.searchsorted(edges, first)] += 1
-            steps[np.searchsorted(edges, last + 1)] -= 1
-    return np.cumsum(steps)[: len(edges) - 1] > 0
+def table_of(end: End, wire: WireSpec, entries: Sequence[Entry]) -> tuple[Table, dict[int, dict[str, Any]], int]:
+    """One end's rows, from batches in order.
+
+    Returns:
+        The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
+    """
+    kinds = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
+    fitting = [one for one in entries if one.header.row_dtype == kinds]
+    columns = [name for name in kinds.names or () if name != "voltages"]
+    wide = {"tick", "session_tick", "answered", "received", "sent", "wall"}
+    form = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in (*columns, "wall")]
+    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype(form))
+    states = dict[int, dict[str, Any]]()
+    filled, next_row = 0, -1
+    for header, payload, *_ in fitting:
+        batch = Batch(header, read_columns(header, payload), Tail())
+        if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
+            states[filled] = whole.tail.state
+        next_row = header.first_row + header.rows
+        rows = table[filled : filled + header.rows]
+        for name in columns:
+            rows[name] = batch.columns[name]
+        rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
+        rows["wall"] = header.wall_ns - header.monotonic_ns
+        filled += header.rows
+    if end == "plant":
+        table["answered"][table["answered"] == NEVER] = NO_TICK
+    return table, states, len(entries) - len(fitting)
