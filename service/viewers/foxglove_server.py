@@ -9,21 +9,20 @@ loop.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from itertools import chain
+from collections.abc import Callable
+from itertools import islice
 from threading import Event
 from typing import Final
 
 import foxglove
-import zenoh
-from zenoh.handlers import Handler, RingChannel
+from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.history import Delivery, RecoveringSubscriber, read_sample
+from aeroloop.protocol.transport.history import RecoveringSubscriber, read_sample
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.viewers.channels import SHAPES, Decoder, topic_of
+from aeroloop.service.viewers.channels import SHAPES, Decoder
 from aeroloop.service.viewers.schemas import Decoded, Shape
 
 ROOM: Final = 1024
@@ -50,7 +49,7 @@ class FoxgloveServer:
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         for name, shape in SHAPES.items():
-            self._open(topic_of(vehicle, name), shape)
+            self._open(f"/{vehicle}/{name}", shape)
         host = f"[{address}]" if ":" in address else address
         try:
             self._server = foxglove.start_server(
@@ -103,15 +102,8 @@ def serve(
         rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
         ready(outlet.url)
         while not stop.wait(1 / rate_hz):
-            for received in chain(descriptions.take(), *(_taken(ring, room) for ring, room in rings)):
+            taken = [sample for ring, room in rings for sample in islice(iter(ring.try_recv, None), room)]
+            for received in (*descriptions.take(), *map(read_sample, taken)):
                 if topic := topics.read_key(received.key):
                     for message in decoder.take(topic, received.payload, received.published_ns):
                         outlet.send(message)
-
-
-def _taken(ring: zenoh.Subscriber[Handler[zenoh.Sample]], room: int) -> Iterator[Delivery]:
-    """What waits in a ring: of a streaming topic the newest message, of another all."""
-    for _ in range(room):
-        if (sample := ring.try_recv()) is None:
-            return
-        yield read_sample(sample)

@@ -29,7 +29,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
-from aeroloop.service.recording.log_file import LogFile
+from aeroloop.service.recording.rolling import LogFile
 
 START_NS: Final = 1_800_000_000_000_000_000
 """When tick 0 is measured, on the plant's wall clock."""
