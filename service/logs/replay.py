@@ -24,7 +24,7 @@ from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
-from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
+from aeroloop.service.logs.ticks import LoggedController, commanded
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -172,10 +172,7 @@ def _replay_session(
         if progress is not None:
             progress(INDEXING + (1 - INDEXING) / 2 * done)
 
-    inputs = [rows[name] for name in ("tick", "received_as", "measurement")]
-    for i, (tick, received_as, measurement) in enumerate(in_rows(inputs, share)):
-        logged.resume(i)
-        answer = logged.answer(tick, received_as, measurement)
+    for answer in logged.answers(share):
         sent_as.append(Sent.NONE if answer is None else Sent.FRAME if answer else Sent.SILENT)
         frames += answer or bytes(wire.command.size)
 

@@ -8,7 +8,7 @@ again, bit for bit; after missing rows, the log has the controller's state.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
@@ -123,6 +123,10 @@ class LoggedController:
         settings: What to compute with; the session's configuration if None.
         ignored: Which parts of the logged changes to leave out.
         resumes: Continue from the recorded state where rows are missing within the session.
+
+    Attributes:
+        controller: The controller.
+        state_before: The law's state before the last row that was answered.
     """
 
     def __init__(
@@ -135,9 +139,33 @@ class LoggedController:
     ) -> None:
         settings = settings or session.settings
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self.state_before = np.array(self.controller.last_valid["state_next"])
+        self._rows = session.controller
         self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
         self._changes: deque[Change] = deque(session.changes)
         self._ignored: dict[str, None] = dict.fromkeys(ignored)
+
+    def answers(self, progress: Progress | None = None) -> Iterator[bytes | None]:
+        """For each row the command that answers it: a frame, UNCHANGED, or None if there is nothing to answer.
+
+        Raises ReviewError if the log has a state of no controller.
+        """
+        rows, state = self._rows, self.controller.last_valid["state_next"]
+        for begin in range(0, len(rows), AT_A_TIME):
+            some = rows[begin : begin + AT_A_TIME]
+            columns = (some[name].tolist() for name in ("tick", "received_as", "measurement"))
+            for i, (tick, received_as, frame) in enumerate(zip(*columns, strict=True), begin):
+                self.resume(i)
+                self.state_before[:] = state
+                if received_as == Received.LATE:
+                    self.controller.hold(frame)
+                if received_as in (Received.FRAME, Received.SILENT):
+                    self.change(tick)
+                    yield self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
+                else:
+                    yield None
+            if progress is not None:
+                progress(min(1.0, (begin + AT_A_TIME) / len(rows)))
 
     def change(self, k: int) -> None:
         """Apply the logged changes of gains and reference up to tick k."""
@@ -145,31 +173,13 @@ class LoggedController:
             self.controller.apply(self._changes.popleft().model_copy(update=self._ignored))
 
     def resume(self, i: int) -> None:
-        """Continue from the state before row i, where the log has it. Raises ReviewError if it is of no controller."""
+        """Continue from the state before row i, where the log has it."""
         if i in self._states:
             try:
                 self.controller.restore(ControllerSnapshot.model_validate(self._states[i]))
             except ValidationError as error:
                 why = str(error).splitlines()[0]
                 raise ReviewError(f"the log has a state that is not of this version: {why}") from None
-
-    def answer(self, tick: int, received_as: int, frame: bytes) -> bytes | None:
-        """The command that answers a row: a frame, UNCHANGED, or None if there is nothing to answer."""
-        if received_as == Received.LATE:
-            self.controller.hold(frame)
-        if received_as not in (Received.FRAME, Received.SILENT):
-            return None
-        self.change(tick)
-        return self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
-
-
-def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
-    """The rows of some columns, as Python's numbers and bytes."""
-    size = len(columns[0])
-    for begin in range(0, size, AT_A_TIME):
-        yield from zip(*(column[begin : begin + AT_A_TIME].tolist() for column in columns), strict=True)
-        if progress is not None:
-            progress(min(1.0, (begin + AT_A_TIME) / size))
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -223,29 +233,23 @@ def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[
     A row has the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u, of these widths. Shape (n, sum).
     """
     logged = LoggedController(session)
-    outputs = logged.controller.outputs
+    outputs, before = logged.controller.outputs, len(logged.state_before)
     names = list(outputs)[: list(outputs).index("u") + 1]
-    state, row = np.asarray(logged.controller.last_valid["state_next"]), np.asarray(logged.controller.row)
-    widths = [len(state), *(len(outputs[name]) for name in names)]
+    widths = [before, *(len(outputs[name]) for name in names)]
     columns = dict(zip(names, pairwise(np.cumsum(widths).tolist()), strict=True))
-    table = np.full((len(session.k), sum(widths)), nan)
-    row = row[: sum(widths[1:])]
+    table, row = np.full((len(session.k), sum(widths)), nan), np.asarray(logged.controller.row)[: sum(widths[1:])]
+    u = slice(*columns["u"])
 
     places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
     over = np.isin(_column(session.plant, session.at_plant, "sent_as"), (Sent.NONE, -1), invert=True)
-    state_before = np.empty_like(state)
-    u = slice(*columns["u"])
-    inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
-    for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
-        logged.resume(i)
-        state_before[:] = state
-        if logged.answer(tick, received_as, frame) is not None and place >= 0:
+    for i, answer in enumerate(logged.answers(progress)):
+        if answer is not None and (place := places[i]) >= 0:
             over[place] = False
             if outputs["measured"][0]:
-                table[place, : len(state)] = state_before
-                table[place, len(state) :] = row
+                table[place, :before] = logged.state_before
+                table[place, before:] = row
                 if not outputs["computed"][0]:
                     table[place, u] = nan
     missed = np.flatnonzero(over)

@@ -196,19 +196,6 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert 0 < len(running.of("/aero/pose")) <= 11  # of a second; rows before the description are not decoded
 
 
-def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
-    gathering: Gathering, record: Record
-) -> None:
-    running = record()
-    settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
-    publish_without_cache(
-        gathering, DESCRIPTION, {number: description(each, "plant").encode() for number, each in settings.items()}
-    )
-    running.await_written(4)
-    running.end()
-    assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
-
-
 def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
     """It ends as soon as its cable is back and a new message has come: 0.9 MB were published meanwhile."""
     port, count = free_port(), 600
@@ -258,18 +245,21 @@ def test_the_last_message_in_a_log_is_that_recording_stopped_and_traces_that_can
     assert note in str(running.of("aeroloop/aero/event/recorder")[-1])
 
 
-def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothing(
+def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and_replace_none(
     gathering: Gathering, record: Record
 ) -> None:
-    running = record()
-    session = gathering.join()
-    names = {topics.key(name, "aero", role="plant"): name for name in topics.RECORDED}
+    running, session = record(), gathering.join()
+    names = [topics.key(name, "aero", role="plant") for name in topics.RECORDED if name != "description"]
     publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
-    running.await_written(len(names) + 2)
+    settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
+    said = {number: description(each, "plant").encode() for number, each in settings.items()}
+    publish_without_cache(gathering, DESCRIPTION, said | {2: b"\xff\x00"})
+    running.await_written(len(names) + 5)
     running.end()
-    assert {key for key, _, data in running.messages() if data == b"\xff\x00"} == set(names)
+    assert {key for key, _, data in running.messages() if data == b"\xff\x00"} == {*names, DESCRIPTION}
+    assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
 
 
 # ── what is lost ──

@@ -20,8 +20,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
-from aeroloop.service.viewers.schemas import Decoded
-from tests.support.decoded import ATTITUDE, NOW, RAW, STATUS, telemetry
+from tests.support.decoded import ATTITUDE, RAW, STATUS, telemetry
 from tests.support.viewer_double import PATIENCE_S, Viewer
 
 TOPICS = {f"/aero/{name}" for name in SHAPES}
@@ -107,27 +106,6 @@ def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all(settings: Sett
             plant.publish("event", Event(role="plant", kind="tripped", text="as it was asked to"))
             assert b"tripped: as it was asked to" in early.first("/aero/log").data
             assert all(early.first(f"/aero/{name}").data for name in ("scene", "command", "status/plant"))
-
-
-def test_a_viewer_that_never_reads_delays_no_other() -> None:
-    """40 MB go to it, far more than sockets and the server's backlog hold."""
-    shape = SHAPES["log"]
-    with (
-        FoxgloveServer("aero", "127.0.0.1", 0) as outlet,
-        Viewer(outlet.url, max_queue=1) as stuck,
-        Viewer(outlet.url) as other,
-    ):
-        for viewer in (stuck, other):
-            viewer.await_topics(*TOPICS)
-            viewer.subscribe("/aero/log")
-        with repeating(lambda: outlet.send(Decoded("/aero/log", shape, b"first", NOW))):
-            other.first("/aero/log")  # so the server knows the subscription
-        for _ in range(640):
-            outlet.send(Decoded("/aero/log", shape, bytes(64 * 1024), NOW))
-        outlet.send(Decoded("/aero/log", shape, b"the last", NOW + 1))
-        while (last := other.first("/aero/log")).data != b"the last":
-            assert last.at_ns <= NOW
-        assert last.at_ns == NOW + 1
 
 
 def test_a_port_in_use_is_one_clear_line() -> None:
