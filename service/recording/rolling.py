@@ -353,14 +353,14 @@ class RollingLog:
             return
         with suppress(OSError):  # a file is gone; the others are removed next time
             others = [path for path in self._base.parent.glob("*.mcap") if path != self.path and self._is_own(path)]
-            stats = sorted((path.stat().st_mtime_ns, path.stat().st_size, path) for path in others)
-            room = keep_gb * 1e9 - self._file.size - sum(size for _, size, _ in stats)
-            for _, size, path in stats:
-                if room >= 0:
+            sizes = {path: path.stat().st_size for path in sorted(others, key=lambda path: path.stat().st_mtime_ns)}
+            excess = self._file.size + sum(sizes.values()) - keep_gb * 1e9
+            for path, size in sizes.items():
+                if excess <= 0:
                     return
                 with suppress(OSError):
                     path.unlink()
-                    room += size
+                    excess -= size
                     self._report(f"removed {path}, the oldest, to keep logs under {keep_gb:g} GB", False)
 
     def _is_own(self, path: Path) -> bool:
