@@ -35,14 +35,10 @@ from aeroloop.service.logs.ticks import Ticks, euler_deg, recompute
 
 Format = Literal["parquet", "csv", "mcap"]
 
-AT_A_TIME: Final = 1 << 16
-"""Rows that are turned into columns at a time."""
-
+AT_A_TIME: Final = 1 << 16  # rows that are turned into columns at a time
 AXES: Final = ("x", "y", "z")
 EULER: Final = ("roll", "pitch", "yaw")
-
-_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})
-"""Characters of a unit in a column's name."""
+_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})  # of a unit in a column's name
 
 
 class ExportError(AeroloopError):
@@ -77,16 +73,8 @@ def export(
 ) -> Exported:
     """Write a run's ticks as a table, or all of it as a log with everything decoded.
 
-    Args:
-        paths: Logs, folders of logs, or the files of a rotated run.
-        to: Format.
-        out: The file; the first log's name with another ending if None.
-        session: As of `Recording.choose`, or `all` of the vehicle.
-        vehicle: As of `Recording.choose`.
-        since_s: From when on, on the law's clock [s].
-        until_s: Until when [s].
-        force: Replace an existing file, unless it is a log.
-        progress: Called repeatedly with the share done, 0…1.
+    The new file has the first log's name with another ending if `out` is None. Session and vehicle are as of
+    `Recording.choose`, or all sessions of the vehicle; times are the law's.
 
     Raises:
         ExportError: There is nothing to export.

@@ -34,17 +34,10 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-DESCRIPTION_METADATA: Final = "aeroloop.description"
-"""Name of the metadata record with a role's description, as JSON under `json`, and its key under `key`."""
-
-RECORDER_METADATA: Final = "aeroloop.recorder"
-"""Name of the metadata record about the file itself: its run, the recording's identity, its part, its beginning."""
-
-CHUNK_BYTES: Final = 64 * 1024
-"""A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
-
-MAX_CHUNK: Final = 16 << 20
-"""Bytes that a record or the content of a chunk may have: a forged size costs no memory."""
+DESCRIPTION_METADATA: Final = "aeroloop.description"  # a role's description as JSON under `json`, its key under `key`
+RECORDER_METADATA: Final = "aeroloop.recorder"  # about the file: its run, the recording's identity, its part, its start
+CHUNK_BYTES: Final = 64 * 1024  # compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once
+MAX_CHUNK: Final = 16 << 20  # bytes of a record, or of what a chunk holds: a forged size costs no memory
 
 _CHECKSUM: Final = "crc32"
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of a record

@@ -25,21 +25,14 @@ from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METAD
 from aeroloop.service.logs.session import Session, SessionKey, join
 from aeroloop.service.logs.trace_index import Entry, Source, TraceIndex, table_of
 
-Progress = Callable[[float], None]
-"""Called repeatedly with the share done, 0…1."""
+Progress = Callable[[float], None]  # called repeatedly with the share done, 0…1
 
-INDEXING: Final = 0.4
-"""Share of the progress that reading the files takes."""
-
-ANSWER_S: Final = 1.2
-"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
-
+INDEXING: Final = 0.4  # share of the progress that reading the files takes
+ANSWER_S: Final = 1.2  # longest time from a measurement until its command acts; a session's first may take a second
+MESSAGES: Final = ("event", "loss", "status", "truth")  # whose messages are read beside the traces
 OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
 """Sections of the configuration by the role that owns them; the others are the controller's. Why: every process is
 configured by itself: the controller's copy of `plant.mass` may differ from the plant's."""
-
-MESSAGES: Final = ("event", "loss", "status", "truth")
-"""Topics whose messages are read beside the traces."""
 
 _Copy = tuple[Path, int, str | bytes, Address | None]
 """A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
@@ -50,18 +43,14 @@ class ReviewError(AeroloopError):
 
 
 class Recording:
-    """The logs of a run.
-
-    Args:
-        paths: Files and folders; of a folder, every `.mcap` in it.
-        progress: Called repeatedly with the share done: reading the files takes `INDEXING` of it.
+    """The logs of a run, from files and folders; of a folder, every `.mcap` in it.
 
     Attributes:
         paths: The files, in the order of their first messages.
         metadata: Metadata that are no descriptions, by name without prefix (`aeroloop.recorder` is `recorder`).
         extents: Recorded extent of each session, in the order of publication.
         missing: Rows that the log lacks.
-        unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
+        unknown: Ticks that `session` leaves out.
         messages: Messages of the topics MESSAGES with their keys, in the order of recording.
         damaged: What of the files is cut or damaged, a line each.
         malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
@@ -112,12 +101,10 @@ class Recording:
     # ── sessions ──
 
     def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
-        """A session. Raises ReviewError if there is none.
+        """A session by its name or number, and its vehicle. Raises ReviewError if there is none.
 
-        Args:
-            session: Its name, alone or as `vehicle/session`, or its number, from 1 in the order of recording; the one
-                with the most ticks if None.
-            vehicle: Its vehicle; any if None, and that of the longest session for a number.
+        Numbers count from 1 in the order of recording, by default of the longest session's vehicle. Without session it
+        is the longest.
         """
         if not self.extents:
             raise ReviewError(f"{self.name} holds no session: no trace of a controller or a plant was recorded")
@@ -129,9 +116,8 @@ class Recording:
         if session is None:
             return longest
         numbered = self.sessions_of(longest[0])
-        named = {str(i): which for i, which in enumerate(numbered, 1)}
-        for which in reversed(known):
-            named |= {which[1]: which, "/".join(which): which}
+        named = {name: which for which in reversed(known) for name in (which[1], "/".join(which))}
+        named = {str(i): which for i, which in enumerate(numbered, 1)} | named
         if session in named:
             return named[session]
         names = ", ".join(f"{i} {which[1]}" for i, which in enumerate(numbered[:20], 1))
@@ -160,9 +146,9 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
+        acting = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
         controller, states, left_out = table_of("controller", settings.wire, computed)
-        its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
-        plant, _, more_left_out = table_of("plant", settings.wire, its)
+        plant, _, more_left_out = table_of("plant", settings.wire, acting)
         self.malformed["trace"] += left_out + more_left_out
         for gap in unknown:
             plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]

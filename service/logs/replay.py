@@ -93,12 +93,8 @@ def replay(
 ) -> Replay:
     """Replay every session of a run.
 
-    Args:
-        paths: Logs, folders of logs, or a rotated run.
-        overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
-            or of the reference replaces every logged change of them. The plant is not replayed then.
-        progress: Called repeatedly with the share done, 0…1.
-        ends: Ends to replay; the plant takes most of the time.
+    With overrides, `section.key=value`, the controller is computed with another law instead, and the plant is not. An
+    override of the gains or of the reference replaces every logged change of them.
 
     Raises:
         ReviewError: It cannot be read, or has no configuration of any end.

@@ -21,8 +21,7 @@ Integers = npt.NDArray[np.int64]
 Places = npt.NDArray[np.int32]
 Table = npt.NDArray[np.void]
 
-SessionKey = tuple[str, str]
-"""A vehicle and a session."""
+SessionKey = tuple[str, str]  # a vehicle and a session
 
 NO_TICK: Final = -1
 

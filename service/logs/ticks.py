@@ -32,14 +32,10 @@ from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 
 Flags = npt.NDArray[np.bool_]
-Codes = npt.NDArray[np.int16] | Array
-"""Codes of frames: integers, or the doubles of a wire that is not quantized."""
+Codes = npt.NDArray[np.int16] | Array  # integers, or the doubles of a wire that is not quantized
 
-AT_A_TIME: Final = 8192
-"""Rows that are turned into Python's objects at a time."""
-
-WINDOW: Final = 512
-"""Ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second."""
+AT_A_TIME: Final = 8192  # rows that are turned into Python's objects at a time
+WINDOW: Final = 512  # ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second
 _LEAST: Final = 16
 
 
@@ -51,8 +47,7 @@ class Ticks(NamedTuple):
         wall_ns: When its measurement was sent, on the plant's wall clock; on the controller's where the plant's rows
             are missing [ns since 1970].
         sent_ns: When it was sent, on the plant's monotonic clock; −1 where it was not [ns].
-        latency_ns: From then until the command that answers it was received, on the same clock. In lockstep, where the
-            plant waits for each command, NaN as both delays.
+        latency_ns: From then until its answer was received. In lockstep the plant waits, so this and delays are NaN.
         measurement_delay_ns: From the plant's sending to the controller's receiving (see `clock_offset`).
         command_delay_ns: From the controller's sending to the plant's receiving.
         attitude: q as measured. The other quantities of the law likewise, in its units.
@@ -118,15 +113,8 @@ class Recomputed(NamedTuple):
 class LoggedController:
     """The controller of a session, which answers its rows again, one after the other.
 
-    Args:
-        session: The session.
-        settings: What to compute with; the session's configuration if None.
-        ignored: Which parts of the logged changes to leave out.
-        resumes: Continue from the recorded state where rows are missing within the session.
-
-    Attributes:
-        controller: The controller.
-        state_before: The law's state before the last row that was answered.
+    With other `settings` than the session's, parts of the logged changes may be `ignored`. It `resumes` from the
+    recorded state where rows are missing. `state_before` is the law's state before the last row.
     """
 
     def __init__(
@@ -146,10 +134,7 @@ class LoggedController:
         self._ignored: dict[str, None] = dict.fromkeys(ignored)
 
     def answers(self, progress: Progress | None = None) -> Iterator[bytes | None]:
-        """For each row the command that answers it: a frame, UNCHANGED, or None if there is nothing to answer.
-
-        Raises ReviewError if the log has a state of no controller.
-        """
+        """The command that answers each row: a frame, UNCHANGED, or None. Raises ReviewError as `resume`."""
         rows, state = self._rows, self.controller.last_valid["state_next"]
         for begin in range(0, len(rows), AT_A_TIME):
             some = rows[begin : begin + AT_A_TIME]
@@ -173,7 +158,7 @@ class LoggedController:
             self.controller.apply(self._changes.popleft().model_copy(update=self._ignored))
 
     def resume(self, i: int) -> None:
-        """Continue from the state before row i, where the log has it."""
+        """Continue from the state before row i, where the log has it. Raises ReviewError if it is of no controller."""
         if i in self._states:
             try:
                 self.controller.restore(ControllerSnapshot.model_validate(self._states[i]))
@@ -228,9 +213,9 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
 
 
 def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[int], Integers]:
-    """What was computed at each tick, and the places of ticks that the plant measured and the controller did not.
+    """Rows of the law's state, q, the state after, q_d, ω, ε̃, ω_e and u at each tick, of these widths.
 
-    A row has the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u, of these widths. Shape (n, sum).
+    And the places of the ticks that the plant measured and the controller did not compute.
     """
     logged = LoggedController(session)
     outputs, before = logged.controller.outputs, len(logged.state_before)
@@ -386,9 +371,8 @@ def clock_offset(forward: Array, backward: Array) -> Array:
         forward  = received by the controller − sent by the plant      = delay of the measurement + offset
         backward = received by the plant − sent by the controller      = delay of the command     − offset
 
-    The offset is half their difference if both ways are equally fast. It is fitted by a straight line over windows of
-    512 ticks, through the half with the shortest round trips. Why: queues and hitches only lengthen a delay. A
-    difference of the medians stays in both delays, with opposite signs. Shapes (n,), NaN where a time is unknown.
+    The offset is half their difference if both ways are equally fast. It is fitted by a straight line over windows,
+    through the half with the shortest round trips, as queues only lengthen a delay. Shapes (n,), NaN for unknown times.
     """
     found, last_ns = np.empty(len(forward)), nan
     for part in np.array_split(np.arange(len(forward)), max(1, round(len(forward) / WINDOW))):
@@ -406,13 +390,9 @@ def clock_offset(forward: Array, backward: Array) -> Array:
 
 
 def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, tuple[float, float]]:
-    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`.
-
-    In lockstep the plant waits for each command, so no duration is a loop's.
-    """
-    rows, plant, at, at_plant, acted = (
-        session.controller, session.plant, session.at_controller, session.at_plant, session.acted
-    )  # fmt: skip
+    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`."""
+    rows, plant = session.controller, session.plant
+    at, at_plant, acted = session.at_controller, session.at_plant, session.acted
     sent = _column(plant, at_plant, "sent")
     wall = np.where(
         at_plant >= 0,

@@ -34,11 +34,9 @@ from aeroloop.protocol.messages.trace import (
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.session import NO_TICK, Extent, Integers, Missing, SessionKey, Table, Unknown
 
-_MOST: Final = 1 << 62
-"""More rows than any process publishes, and more nanoseconds than any clock counts."""
+_MOST: Final = 1 << 62  # more rows than any process publishes, and more nanoseconds than any clock counts
 
-Ranges = Sequence[tuple[int, int]]
-"""First and last tick of each."""
+Ranges = Sequence[tuple[int, int]]  # first and last tick of each
 
 
 class Source(NamedTuple):
@@ -133,10 +131,9 @@ class TraceIndex:
             self._find_unknown(which, max(extent.last["controller"], proofs["plant"]))
 
     def _sort_out(self) -> None:
-        """Put batches in order, without those that no process of the session publishes.
+        """Put batches in order, without those that overlap others and those of a session that is another process's.
 
-        Those overlap others; or more rows of the session, of the same end, are of another process: a process claims a
-        session or grants it, so batches of its name and of another process are untrusted.
+        A process claims a session or grants it, so the one with most of its rows at an end owns it.
         """
         rows: defaultdict[tuple[str, End, str], Counter[Source]] = defaultdict(Counter)
         for source, entries in self.entries.items():

@@ -138,18 +138,17 @@ class LogFile:
             self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[shape])
         return self._channels[topic]
 
-    def add_metadata(self, name: str, entries: dict[str, str]) -> None:
+    def add_metadata(self, name: str, **entries: str) -> None:
         """Add a metadata record, under a checksum."""
         self._writer.add_metadata(name, with_checksum(name, entries))
 
     def add_description(self, key: str, payload: bytes) -> None:
         """Add a role's last description as metadata."""
-        self.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": payload.decode()})
+        self.add_metadata(DESCRIPTION_METADATA, key=key, json=payload.decode())
 
-    def attach_specification(self, at_ns: int) -> None:
-        """Attach the wire's specification, which a reader of frames needs."""
-        text = files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
-        self._writer.add_attachment(at_ns, at_ns, "protocol/SPEC.md", "text/markdown", text)
+    def attach(self, name: str, kind: str, data: bytes, at_ns: int) -> None:
+        """Attach a file of a media type."""
+        self._writer.add_attachment(at_ns, at_ns, name, kind, data)
 
     @property
     def removed(self) -> bool:
@@ -168,12 +167,12 @@ class LogFile:
         self._writer.flush()
 
     def end(self) -> None:
-        """Write the last chunk and the index, and close the file. After an OSError only `abandon` is allowed."""
+        """Write the last chunk and the index, and close the file. After an OSError only `close` is allowed."""
         self._writer.finish()
         self.flush()
-        self._file.close()
+        self.close()
 
-    def abandon(self) -> None:
+    def close(self) -> None:
         """Close the file as it is on the disk; drop what is not written."""
         self._file.close()
 
@@ -191,14 +190,11 @@ class RollingLog:
         report: Callable[[str, bool], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.settings = settings
-        self.written = 0
-        self.trouble = ""
+        self.settings, self.written, self.trouble = settings, 0, ""
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
         self._base = log_path(settings.path, _BY_TIME)
-        ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
-        self._runs = re.compile(ours)
+        self._ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
@@ -251,7 +247,7 @@ class RollingLog:
             self._unwritten.clear()
             self._end(self._file)
         except OSError as error:
-            self._file.abandon()
+            self._file.close()
             lost = waiting + len(self._unwritten)
             what = f"{lost} messages and the index" if lost else "the index"
             raise RecorderError(
@@ -300,23 +296,20 @@ class RollingLog:
         """
         last = self._file
         if last.removed:
-            last.abandon()  # while it is open, it takes its room from a disk that may be full
+            last.close()  # while it is open, it takes its room from a disk that may be full
         self._file = self._begin()
         self._unwritten.clear()
         try:
             if not last.removed:
                 self._end(last)
         except OSError as error:
-            last.abandon()
+            last.close()
             what = f"the index of {last.path} could not be written: {error.strerror}"
             self._report(f"{what}; `aeroloop log recover` gives it one", True)
         self._remove_oldest()
 
     def _end(self, file: LogFile) -> None:
-        """Put the descriptions at the file's end, too, and close it. Raises OSError.
-
-        Why twice: a damaged copy must not cost the log.
-        """
+        """Put the descriptions at the file's end, too, as a damaged copy must not cost the log, and close it."""
         for key, description in self._descriptions.items():
             file.add_description(key, description)
         file.end()
@@ -329,18 +322,25 @@ class RollingLog:
             path = self._base.with_stem(f"{self._base.stem}-{part:04}")
         file = LogFile(path)
         try:
-            started = datetime.now(UTC)
-            run = {"run": self._base.stem, "id": self._id, "part": path.stem}
-            run["started"] = started.isoformat(timespec="seconds")
-            file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
-            file.attach_specification(round(started.timestamp() * 1e9))
+            now = datetime.now(UTC)
+            run = {
+                "run": self._base.stem,
+                "id": self._id,
+                "part": path.stem,
+                "started": now.isoformat(timespec="seconds"),
+            }
+            file.add_metadata(RECORDER_METADATA, json=json.dumps(run))
+            specification = (
+                files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
+            )  # which a reader of frames needs
+            file.attach("protocol/SPEC.md", "text/markdown", specification, round(now.timestamp() * 1e9))
             for key, description in self._descriptions.items():
                 file.add_description(key, description)
             for entry in self._unwritten:
                 file.add(*entry)
             file.commit()
         except OSError:
-            file.abandon()
+            file.close()
             with suppress(OSError):
                 path.unlink()
             raise
@@ -369,5 +369,5 @@ class RollingLog:
             _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
             if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                return run["part"] == path.stem and self._runs.fullmatch(run["run"]) is not None
+                return run["part"] == path.stem and re.fullmatch(self._ours, run["run"]) is not None
         return False

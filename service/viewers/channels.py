@@ -197,7 +197,7 @@ def _converted(message: Message, address: topics.Address, wire: _Wire | None, at
             return {}
 
 
-def _tracking(message: Telemetry, wire: _Wire | None) -> Tracking:
+def _tracking(message: Telemetry, wire: _Wire | None) -> BaseModel:
     x, y, z = message.attitude_error
     scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
     (sign,) = message.state.get("sign", (None,))[:1]
@@ -219,7 +219,7 @@ def _degree(radians: float) -> float:
     return round(degrees(radians), 4) + 0.0  # never −0
 
 
-def _attitude(q: attitude.Quaternion | None, rate: attitude.Vector) -> Attitude:
+def _attitude(q: attitude.Quaternion | None, rate: attitude.Vector) -> BaseModel:
     """Angles, null if they are not known, and rates in the body frame from [rad/s], null where they are NaN."""
     angles = attitude.to_euler(q) if q else (nan, nan, nan)
     return Attitude(**dict(zip(Attitude.model_fields, map(_degree, (*angles, *rate)), strict=True)))
