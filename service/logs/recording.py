@@ -45,25 +45,15 @@ class ReviewError(AeroloopError):
 class Recording:
     """The logs of a run, from files and folders; of a folder, every `.mcap` in it.
 
-    Attributes:
-        paths: The files, in the order of their first messages.
-        metadata: Metadata that are no descriptions, by name without prefix (`aeroloop.recorder` is `recorder`).
-        extents: Recorded extent of each session, in the order of publication.
-        missing: Rows that the log lacks.
-        unknown: Ticks that `session` leaves out.
-        messages: Messages of the topics MESSAGES with their keys, in the order of recording.
-        damaged: What of the files is cut or damaged, a line each.
-        malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
-
     Raises:
         ReviewError: There is no log, it cannot be read, has another version of the protocol, or is of another run.
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
-        self.metadata: dict[str, dict[str, Any]] = {}
-        self.messages: list[tuple[Address, Message]] = []
-        self.damaged: list[str] = []
-        self.malformed: Counter[str] = Counter()
+        self.metadata: dict[str, dict[str, Any]] = {}  # but descriptions, by name without its prefix `aeroloop.`
+        self.messages: list[tuple[Address, Message]] = []  # of the topics MESSAGES, in the order of recording
+        self.damaged: list[str] = []  # what of the files is cut or damaged, a line each
+        self.malformed: Counter[str] = Counter()  # messages by topic; they cost nothing else
         self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
         self._index = TraceIndex()
         begins_ns, marks, copies = dict[Path, int](), dict[Path, set[object]](), list[_Copy]()
@@ -81,7 +71,7 @@ class Recording:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
             raise ReviewError(f"cannot read {error.filename or paths[0]}: {error.strerror}") from None
-        self.paths = sorted(begins_ns, key=begins_ns.__getitem__)
+        self.paths = sorted(begins_ns, key=begins_ns.__getitem__)  # in the order of their first messages
         _check_that_all_are_of_one_run(marks)
         self._add_descriptions(copies)
         self._index.finish()

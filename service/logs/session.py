@@ -78,39 +78,22 @@ class Session:
     """Both ends' rows of a session in order, and their join on the tick. Rows of unknown ticks are left out.
 
     Times are on the end's monotonic clock, −1 for none [ns]; with `wall` added they are on its wall clock.
-
-    Attributes:
-        which: The session.
-        settings: The configuration, each section from the role that owns it.
-        descriptions: Of the roles as the session began.
-        extent: What was recorded of it.
-        controller: Columns tick, received_as, sent_as, received, sent, wall, measurement, command.
-        plant: Columns tick, session_tick, sent_as, received_as, outcome, trip, answered (−1 for none), sent, received,
-            wall, measurement, command.
-        changes: Changes of gains and reference, in the order of their ticks.
-        states: The controller's state before its first row and each first row after a gap, by the row's index.
-        missing: Rows that the log lacks.
-        unknown: Ticks that are left out, as the log does not hold what was in force then.
-        k: Ticks with a row of either end. Shape (n,).
-        at_controller: Index of the controller's row that computed each tick, or −1. Shape (n,).
-        at_plant: Index of the plant's row of each tick, or −1. Shape (n,).
-        acted: Index of the plant's row that first acted on the command that answers each tick, or −1. Shape (n,).
     """
 
     which: SessionKey
-    settings: Settings
-    descriptions: dict[str, Description]
+    settings: Settings  # each section from the role that owns it
+    descriptions: dict[str, Description]  # of the roles as the session began
     extent: Extent
-    controller: Table
-    plant: Table
-    changes: list[Change]
-    states: dict[int, dict[str, Any]]
-    missing: list[Missing]
+    controller: Table  # tick, received_as, sent_as, received, sent, measurement, command, wall
+    plant: Table  # tick, session_tick, sent_as, received_as, outcome, trip, answered (−1: none), sent, received, …
+    changes: list[Change]  # of gains and reference, in the order of their ticks
+    states: dict[int, dict[str, Any]]  # the controller's before its first row and each after a gap, by the row's index
+    missing: list[Missing]  # rows that the log lacks
     unknown: list[Unknown]
-    k: Integers
-    at_controller: Places
-    at_plant: Places
-    acted: Places
+    k: Integers  # ticks with a row of either end. Shape (n,)
+    at_controller: Places  # index of the controller's row that computed each tick, or −1. Shape (n,)
+    at_plant: Places  # index of the plant's row of each tick, or −1. Shape (n,)
+    acted: Places  # index of the plant's row that first acted on the command that answers it, or −1. Shape (n,)
 
 
 def join(

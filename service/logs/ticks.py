@@ -40,40 +40,26 @@ _LEAST: Final = 16
 
 
 class Ticks(NamedTuple):
-    """Ticks in order, a row each. What is unknown is NaN, a time −1. Shapes (n,) and (n, columns).
+    """Ticks in order, a row each. What is unknown is NaN, a time −1. Shapes (n,) and (n, columns)."""
 
-    Attributes:
-        k: Tick of the law; its time is k·period.
-        wall_ns: When its measurement was sent, on the plant's wall clock; on the controller's where the plant's rows
-            are missing [ns since 1970].
-        sent_ns: When it was sent, on the plant's monotonic clock; −1 where it was not [ns].
-        latency_ns: From then until its answer was received. In lockstep the plant waits, so this and delays are NaN.
-        measurement_delay_ns: From the plant's sending to the controller's receiving (see `clock_offset`).
-        command_delay_ns: From the controller's sending to the plant's receiving.
-        attitude: q as measured. The other quantities of the law likewise, in its units.
-        voltages: What was commanded; NaN where nothing was, or no valid value [V].
-        unquantized: u before quantization [V].
-        gains: The law's gains, one beside the other.
-        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad] and the sign of the equilibrium.
-        state_next: The same after the tick. Where the controller computed nothing, that of the last tick that it did.
-    """
-
-    k: Integers
-    wall_ns: Integers
-    sent_ns: Integers
-    latency_ns: Array
-    measurement_delay_ns: Array
-    command_delay_ns: Array
-    attitude: Array
-    desired: Array
-    rate: Array
-    attitude_error: Array
-    rate_error: Array
-    voltages: Array
-    unquantized: Array
-    gains: Array
-    state: Array
-    state_next: Array
+    k: Integers  # tick of the law; its time is k·period
+    wall_ns: (
+        Integers  # when it was measured, on the plant's wall clock; on the controller's where the plant's row lacks
+    )
+    sent_ns: Integers  # when the measurement was sent, on the plant's monotonic clock; −1 where it was not
+    latency_ns: Array  # from then until its answer was received; as both delays NaN in lockstep, where the plant waits
+    measurement_delay_ns: Array  # from the plant's sending to the controller's receiving; see `clock_offset`
+    command_delay_ns: Array  # from the controller's sending to the plant's receiving
+    attitude: Array  # q as measured
+    desired: Array  # q_d
+    rate: Array  # ω as measured, body frame [rad/s]
+    attitude_error: Array  # ε̃
+    rate_error: Array  # ω_e, body frame [rad/s]
+    voltages: Array  # what was commanded; NaN where nothing was, or no valid value [V]
+    unquantized: Array  # u before quantization [V]
+    gains: Array  # the law's gains, one beside the other
+    state: Array  # the law's named state that it used; of the paper's θ̂ [N·m·s/rad] and the sign of the equilibrium
+    state_next: Array  # the same after the tick; of the last tick before where the controller computed nothing
 
     @property
     def desired_rate(self) -> Array:
@@ -86,28 +72,16 @@ class Ticks(NamedTuple):
 
 
 class Recomputed(NamedTuple):
-    """A session, computed again.
+    """A session, computed again."""
 
-    Attributes:
-        ticks: Ticks with a valid measurement, up to the last that was answered. A tick that the controller did not
-            compute has the errors of the plant's own measurement.
-        answered: Ticks that a command answered, be it one without a valid value. Shape (m,).
-        voltages: What was commanded at them [V]. Shape (m, actuators).
-        missed: Ticks up to the last answered one that the plant measured and the controller did not compute.
-        unsent: How many of the judged measurements, and of the answers, were silent.
-        measurements: Codes of all measurement frames. Shape (n, 6).
-        commands: Codes of all command frames. Shape (n, actuators).
-        offset_ns: Between both ends' clocks, at the first and the last tick where it is known; NaN if it is not.
-    """
-
-    ticks: Ticks
-    answered: Integers
-    voltages: Array
-    missed: Integers
-    unsent: tuple[int, int]
-    measurements: Codes
-    commands: Codes
-    offset_ns: tuple[float, float]
+    ticks: Ticks  # with a valid measurement, up to the last answered; errors are the plant's own where only it ran
+    answered: Integers  # ticks that a command answered, be it one without a valid value. Shape (m,)
+    voltages: Array  # what was commanded at them [V]. Shape (m, actuators)
+    missed: Integers  # ticks up to the last answered one that the plant measured and the controller did not compute
+    unsent: tuple[int, int]  # how many of the judged measurements, and of the answers, were silent
+    measurements: Codes  # codes of all measurement frames. Shape (n, 6)
+    commands: Codes  # codes of all command frames. Shape (n, actuators)
+    offset_ns: tuple[float, float]  # between the ends' clocks, at the first and the last tick where it is known, or NaN
 
 
 class LoggedController:

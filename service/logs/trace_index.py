@@ -66,26 +66,16 @@ class Entry(NamedTuple):
 
 
 class TraceIndex:
-    """Which batches a run's traces have; after `finish`, also what they lack.
-
-    Attributes:
-        extents: Recorded extent of each session, in the order of publication.
-        missing: Missing rows.
-        changes: Changes of gains and reference of each session, in order.
-        unknown: Ticks whose gains, reference or law's state the log does not hold.
-        entries: Batches of each process, in the order of its rows, none twice.
-        parts: Batches of each session and end, likewise.
-        malformed: Batches that are malformed, or of no process of the session.
-    """
+    """Which batches a run's traces have; after `finish`, also what they lack."""
 
     def __init__(self) -> None:
-        self.extents: dict[SessionKey, Extent] = {}
+        self.extents: dict[SessionKey, Extent] = {}  # in the order of publication
         self.missing: list[Missing] = []
-        self.changes: dict[SessionKey, list[Change]] = {}
-        self.unknown: list[Unknown] = []
-        self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)
-        self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)
-        self.malformed = 0
+        self.changes: dict[SessionKey, list[Change]] = {}  # of gains and reference, in order
+        self.unknown: list[Unknown] = []  # ticks whose gains, reference or law's state the log does not hold
+        self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)  # of a process, in the order of its rows
+        self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)  # likewise
+        self.malformed = 0  # batches that are malformed, or of no process of the session
         self._known: set[int] = set()
 
     def add(self, vehicle: str, payload: bytes, published_ns: int) -> set[object]:
