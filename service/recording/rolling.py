@@ -155,13 +155,6 @@ class LogFile:
         """Whether the file has no name any more, or is closed."""
         return self._file.closed or os.fstat(self._file.fileno()).st_nlink == 0
 
-    @property
-    def replaced(self) -> bool:
-        """Whether the file was moved or removed while it was written."""
-        with suppress(OSError):
-            return self.removed or not os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
-        return True
-
     def commit(self) -> None:
         """Close the chunk and write it. Raises OSError; then it is written with the next."""
         self._writer.flush()
@@ -241,7 +234,7 @@ class RollingLog:
             RecorderError: Not all could be written; all written before is whole.
         """
         try:
-            if self._file.replaced:
+            if self._file.removed:
                 self._next_file()
             self._file.commit()
             self._unwritten.clear()
@@ -258,8 +251,8 @@ class RollingLog:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
     def _write(self) -> None:
-        """Write the chunk, into a new file if this one is gone or broken; begin the next file if that is due."""
-        now, last, gone = self._clock(), self.path, self._file.replaced
+        """Write the chunk, into a new file if this one is removed or broken; begin the next file if that is due."""
+        now, last, gone = self._clock(), self.path, self._file.removed
         try:
             if gone or self._broken:
                 self._next_file()
@@ -277,7 +270,7 @@ class RollingLog:
             self.trouble, self._broken = "", False
             self._report(f"recording again to {self.path}", False)
         elif gone:
-            self._report(f"{last} was moved or removed while it was written", True)
+            self._report(f"{last} was removed while it was written", True)
         if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= MAX_FILE_S:
             try:
                 self._next_file()
@@ -290,10 +283,7 @@ class RollingLog:
         self._report(text, True)
 
     def _next_file(self) -> None:
-        """Begin a new file with what is unwritten, and close the last one. Raises OSError if none can be begun.
-
-        The last one gets what is unwritten, too, if it takes it: where it was moved to, it is whole.
-        """
+        """Begin a new file with what is unwritten, and close the last one. Raises OSError if none can be begun."""
         last = self._file
         if last.removed:
             last.close()  # while it is open, it takes its room from a disk that may be full
