@@ -36,13 +36,10 @@ from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, R
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
-CHUNK_S: Final = 1.0
-"""A chunk is written this often: the most that a crash or a power cut costs [s]."""
-MAX_FILE_S: Final = 3600.0
-"""A new file begins after this time: what a viewer opens at once [s]."""
+CHUNK_S: Final = 1.0  # a chunk is written this often: the most that a crash or a power cut costs
+MAX_FILE_S: Final = 3600.0  # a new file begins after this time: what a viewer opens at once
 RETRY_S: Final = 1.0
-REMIND_S: Final = 60.0
-"""How often a fault that lasts is reported again [s]."""
+REMIND_S: Final = 60.0  # how often a fault that lasts is reported again
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _BY_TIME: Final = "aeroloop-%Y%m%d-%H%M%S.mcap"
 _TRACE: Final = Shape(
@@ -312,18 +309,11 @@ class RollingLog:
             path = self._base.with_stem(f"{self._base.stem}-{part:04}")
         file = LogFile(path)
         try:
-            now = datetime.now(UTC)
-            run = {
-                "run": self._base.stem,
-                "id": self._id,
-                "part": path.stem,
-                "started": now.isoformat(timespec="seconds"),
-            }
+            now, text = datetime.now(UTC), files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
+            started = now.isoformat(timespec="seconds")
+            run = {"run": self._base.stem, "id": self._id, "part": path.stem, "started": started}
             file.add_metadata(RECORDER_METADATA, json=json.dumps(run))
-            specification = (
-                files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
-            )  # which a reader of frames needs
-            file.attach("protocol/SPEC.md", "text/markdown", specification, round(now.timestamp() * 1e9))
+            file.attach("protocol/SPEC.md", "text/markdown", text, round(now.timestamp() * 1e9))  # to read frames by
             for key, description in self._descriptions.items():
                 file.add_description(key, description)
             for entry in self._unwritten:

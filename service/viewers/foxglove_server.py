@@ -25,10 +25,8 @@ from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.viewers.channels import SHAPES, Decoder
 from aeroloop.service.viewers.schemas import Decoded, Shape
 
-ROOM: Final = 1024
-"""Events, losses or statuses that may wait to be taken; of streaming topics, one message."""
-BACKLOG: Final = 256
-"""Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
+ROOM: Final = 1024  # events, losses or statuses that may wait to be taken; of streaming topics, one message
+BACKLOG: Final = 256  # messages that wait for one slow client, about a second of all; beyond, its oldest are dropped
 
 
 class FoxgloveServerError(AeroloopError):
