@@ -136,9 +136,10 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
+        payloads = self._index.payloads
         acting = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
-        controller, states, left_out = table_of("controller", settings.wire, computed)
-        plant, _, more_left_out = table_of("plant", settings.wire, acting)
+        controller, states, left_out = table_of("controller", settings.wire, computed, payloads)
+        plant, _, more_left_out = table_of("plant", settings.wire, acting, payloads)
         self.malformed["trace"] += left_out + more_left_out
         for gap in unknown:
             plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
@@ -160,7 +161,8 @@ class Recording:
         """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
         for source, entries in self._index.entries.items():
             if source.end == "plant" and entries:
-                batches = [batch for entry in entries if (batch := read_batch(entry.payload)) is not None]
+                payloads = (bytes(self._index.payloads[entry.place]) for entry in entries)
+                batches = [batch for payload in payloads if (batch := read_batch(payload)) is not None]
                 yield source, self._described_before(source.vehicle, "plant", entries), batches
 
     def release(self) -> None:

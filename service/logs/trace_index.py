@@ -51,7 +51,7 @@ class Entry(NamedTuple):
     """A batch of a trace, as it was recorded."""
 
     header: Header
-    payload: bytes
+    place: slice  # of its bytes in `TraceIndex.payloads`
     published_ns: int
     first: int  # tick of the first row
     last: int  # highest tick; a late row is of an earlier one
@@ -75,6 +75,7 @@ class TraceIndex:
         self.unknown: list[Unknown] = []  # ticks whose gains, reference or law's state the log does not hold
         self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)  # of a process, in the order of its rows
         self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)  # likewise
+        self.payloads = bytearray()  # one object: many small ones would not return 140 MB an hour to the system
         self.malformed = 0  # batches that are malformed, or of no process of the session
         self._known: set[int] = set()
 
@@ -90,7 +91,9 @@ class TraceIndex:
             self._known.add(identity)
             changes = [change for change in tail.changes if change.session == session]
             record = tail.record if all(change.session == session for change in tail.record) else []
-            self.entries[source].append(Entry(header, payload, published_ns, *_ticks(batch), changes, record))
+            place = slice(len(self.payloads), len(self.payloads) + len(payload))
+            self.payloads += payload
+            self.entries[source].append(Entry(header, place, published_ns, *_ticks(batch), changes, record))
         return {source, (vehicle, session)} if session else {source}
 
     def finish(self) -> None:
@@ -238,7 +241,9 @@ def _within(ticks: Integers, ranges: Ranges) -> npt.NDArray[np.bool_]:
     return np.searchsorted(np.sort(firsts), ticks, "right") > np.searchsorted(np.sort(lasts), ticks, "left")
 
 
-def table_of(end: End, wire: WireSpec, entries: Sequence[Entry]) -> tuple[Table, dict[int, dict[str, Any]], int]:
+def table_of(
+    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: bytearray
+) -> tuple[Table, dict[int, dict[str, Any]], int]:
     """One end's rows, from batches in order.
 
     Returns:
@@ -252,7 +257,8 @@ def table_of(end: End, wire: WireSpec, entries: Sequence[Entry]) -> tuple[Table,
     table = np.zeros(sum(one.header.rows for one in fitting), np.dtype(form))
     states = dict[int, dict[str, Any]]()
     filled, next_row = 0, -1
-    for header, payload, *_ in fitting:
+    for header, place, *_ in fitting:
+        payload = bytes(payloads[place])
         batch = Batch(header, read_columns(header, payload), Tail())
         if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
             states[filled] = whole.tail.state
