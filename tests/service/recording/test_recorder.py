@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from mcap.reader import make_reader
 from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
@@ -31,6 +30,7 @@ from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
 from tests.support.cable import Cable
+from tests.support.edited_log import by_mcap, contents
 from tests.support.made_log import description, made
 from tests.support.zenoh_network import Gathering, eventually, free_port
 
@@ -81,12 +81,7 @@ class Running:
 
     def messages(self) -> list[tuple[str, int, bytes]]:
         """Key, number and payload, in the order of arrival."""
-        found = []
-        for path in parts(self.path):
-            with path.open("rb") as file:
-                read = make_reader(file).iter_messages(log_time_order=False)
-                found += [(channel.topic, one.sequence, one.data) for _, channel, one in read]
-        return found
+        return [(one.topic, one.sequence, one.data) for path in parts(self.path) for one in by_mcap(path)]
 
     def of(self, key: str) -> list[bytes]:
         """Payloads of one publisher, by its numbers."""
@@ -137,7 +132,7 @@ class Publisher:
     """Publishes messages from a cache of 65 000."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.session, self.count = session, 0
+        self.count = 0
         self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
 
     def send(self, until: int, size: int = 1) -> None:
@@ -161,9 +156,7 @@ def publish_without_cache(gathering: Gathering, key: str, messages: dict[int, by
 
 def descriptions(path: Path) -> dict[str, bytes]:
     """The last description of each key that a file has as metadata."""
-    with path.open("rb") as file:
-        metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-    return {entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA}
+    return {entry["key"]: entry["json"].encode() for name, entry in contents(path)[1] if name == DESCRIPTION_METADATA}
 
 
 # ── what is recorded ──

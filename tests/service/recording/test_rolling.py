@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.records import Channel, Message
+from mcap.records import Attachment, Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.copies import recover
@@ -24,6 +23,7 @@ from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded, Shape
+from tests.support.edited_log import by_mcap, contents
 
 KEY, DESCRIPTION = "aeroloop/aero/telemetry", "aeroloop/aero/description/plant"
 START_NS = 1_800_000_000_000_000_000
@@ -114,8 +114,7 @@ def numbers(path: Path, damages: list[str] | None = None) -> list[int]:
 
 def indexed(path: Path) -> tuple[int, int]:
     """How many messages, raw and decoded, mcap's own reader finds by the index; checksums checked."""
-    with path.open("rb") as file:
-        topics = [channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages()]
+    topics = [one.topic for one in by_mcap(path)]
     return topics.count(KEY), topics.count("/aero/x")
 
 
@@ -257,11 +256,9 @@ def test_each_file_of_a_run_can_be_read_alone_and_is_no_longer_than_configured_b
     else:
         assert all(399 <= len(numbers(path)) <= 460 for path in files[:-1])
     for path in files:
-        with path.open("rb") as file:
-            reader = make_reader(file)
-            found = [(one.name, dict(one.metadata)) for one in reader.iter_metadata()]
-            attachments = {one.name: one.data for one in reader.iter_attachments()}
-        assert attachments == {"protocol/SPEC.md": Path("protocol/SPEC.md").read_bytes()}
+        (attached,) = [one for one in records(path) if isinstance(one, Attachment)]
+        assert (attached.name, attached.data) == ("protocol/SPEC.md", Path("protocol/SPEC.md").read_bytes())
+        _, found = contents(path)
         description = with_checksum(DESCRIPTION_METADATA, {"key": DESCRIPTION, "json": '{"a":1}'})
         assert [entries for name, entries in found if name == DESCRIPTION_METADATA] == [description] * 2
         (known,) = [json.loads(entries["json"]) for name, entries in found if name == RECORDER_METADATA]
