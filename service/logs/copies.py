@@ -41,9 +41,7 @@ class Recovery(BaseModel, frozen=True):
 def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
     """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
 
-    Raises:
-        OutputError: The new file must not be written, or cannot.
-        RecoverError: It is not an MCAP file, or cannot be read.
+    Raises OutputError if the new file must not be written, or cannot; RecoverError if there is nothing to recover.
     """
     try:
         broken.stat()
@@ -63,11 +61,7 @@ def write_decoded(
 ) -> tuple[int, list[str], list[str]]:
     """Write a run as one log with every message decoded, which the recorder does at a bounded rate only.
 
-    Returns:
-        How many messages were written, their topics, and what of the log could not be read, a line each.
-
-    Raises:
-        OSError: It cannot be written.
+    Returns how many messages were written, their topics, and what could not be read. Raises OSError.
     """
     from aeroloop.service.viewers.channels import Decoder
 
@@ -84,12 +78,8 @@ def _copy(
 ) -> tuple[int, list[str], list[str]]:
     """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
 
-    Returns:
-        How many messages were written, their topics, and what could not be read, a line each.
-
-    Raises:
-        NotMcapError: A file is not an MCAP file.
-        OSError: A file cannot be read, or the new one cannot be written.
+    Returns how many messages were written, their topics, and what could not be read, a line each. Raises NotMcapError,
+    and OSError if a file cannot be read or the new one cannot be written.
     """
     messages, done, size = 0, 0, max(1, sum(path.stat().st_size for path in paths))
     names, attached, damages = set[str](), set[str](), list[str]()

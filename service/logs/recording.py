@@ -218,18 +218,16 @@ class Recording:
         One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
         end it is a damage. Why: without it, the other end's configuration stands for it.
         """
-        unreadable = list[tuple[_Copy, str]]()
-        for copy in sorted(copies, key=lambda one: one[1]):
+        unreadable = list[tuple[Path, int, Address | None, str]]()
+        for path, at_ns, text, address in sorted(copies, key=lambda one: one[1]):
             try:
-                found = _read_description(copy[2], copy[3])
+                found = _read_description(text, address)
+                self._descriptions[found.vehicle, found.role].append((at_ns, found))
             except ValueError as error:
-                unreadable.append((copy, str(error).splitlines()[0]))
-            else:
-                self._descriptions[found.vehicle, found.role].append((copy[1], found))
+                unreadable.append((path, at_ns, address, str(error).splitlines()[0]))
         if unreadable and not self._descriptions:
-            (path, *_), why = unreadable[0]
-            raise ReviewError(f"{path} is not a log of this version: {why}")
-        for (path, at_ns, _, address), why in unreadable:
+            raise ReviewError(f"{unreadable[0][0]} is not a log of this version: {unreadable[0][3]}")
+        for path, at_ns, address, why in unreadable:
             known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
             if at_ns and known:
                 self.malformed["description"] += 1

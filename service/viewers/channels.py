@@ -27,7 +27,7 @@ from aeroloop.service.viewers.schemas import Attitude, Decoded, Tracking, Voltag
 
 WORLD: Final = "world"
 ROLES: Final = ("plant", "controller", "recorder")
-"""Roles with a status topic from the start; statuses of other roles are decoded, too."""
+"""Roles with a status topic."""
 
 _ATTITUDE, _STATUS = json_shape(Attitude), json_shape(Status)
 _POSE: Final = protobuf_shape(foxglove.PoseInFrame.get_schema())
@@ -165,8 +165,7 @@ def _encoded(vehicle: str, shown: _Shown, at_ns: int) -> list[Decoded]:
     found = []
     for name, content in shown.items():
         data = content.model_dump_json().encode() if isinstance(content, BaseModel) else content.encode()
-        shape = SHAPES.get(name, _STATUS)  # any role may publish a status
-        found.append(Decoded(f"/{vehicle}/{name}", shape, data, at_ns))
+        found.append(Decoded(f"/{vehicle}/{name}", SHAPES[name], data, at_ns))
     return found
 
 
@@ -182,7 +181,7 @@ def _converted(message: Message, address: topics.Address, wire: _Wire | None, at
             return {"truth": _attitude(message.attitude, message.rate)}
         case Setpoint():
             return {"setpoint": message}
-        case Status():
+        case Status() if address.role in ROLES:
             shown: _Shown = {f"status/{address.role}": message}
             if address.role == "plant" and wire is not None:  # with every status, for a viewer that connects late
                 shown["scene"] = _scene(address.vehicle, wire.kind, at_ns)
