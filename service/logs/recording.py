@@ -253,13 +253,14 @@ class Recording:
                     copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
                 case Metadata(name=name, metadata=entries) if name.startswith("aeroloop."):
                     try:
-                        content = dict(from_json(entries.get("json", "{}")))
-                    except (ValueError, TypeError) as error:
+                        content = from_json(entries.get("json", "{}"))
+                    except ValueError as error:
                         damages.append(f"metadata {name}: {str(error).splitlines()[0]}")
-                        continue
-                    self.metadata[name.removeprefix("aeroloop.")] = content
-                    if name == RECORDER_METADATA and isinstance(content.get("id"), str):
-                        identity = content["id"]
+                        content = None
+                    if isinstance(content, dict):
+                        self.metadata[name.removeprefix("aeroloop.")] = content
+                        if name == RECORDER_METADATA and isinstance(content.get("id"), str):
+                            identity = content["id"]
                 case Message(publish_time=at_ns, data=data):
                     begin_ns = begin_ns or record.log_time
                     if (address := addresses.get(record.channel_id)) is None:
