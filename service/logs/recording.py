@@ -22,8 +22,7 @@ from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
-from aeroloop.service.logs.session import Session, SessionKey, join
-from aeroloop.service.logs.trace_index import Entry, Source, TraceIndex, table_of
+from aeroloop.service.logs.session import Entry, Session, SessionKey, Source, TraceIndex, join, table_of
 
 Progress = Callable[[float], None]  # called repeatedly with the share done, 0…1
 

@@ -1,9 +1,19 @@
-"""A session of a log: a table of rows for each end, joined on the tick; and the plant's true states."""
+"""Sessions of a log: which batches there are, what the log lacks, what was in force when, and both ends' joined tables.
+
+Rows are numbered per process of an end, so a jump in the numbers is the number of missing rows.
+
+The tail of a controller's batch has the changes among its rows and, once a second, the record of what is in force with
+the tick since when; the plant's batches repeat the last record that the controller sent. So a record proves what was in
+force from that tick to its own, and from a proven tick on the rows of the controller prove it up to a gap, after which
+they count from the first batch that begins with gains and reference known. No reader computes anything of other ticks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import inf
 from typing import Any, Final, Literal, NamedTuple
 
@@ -13,7 +23,20 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import MAX_SIGNALS, Description, Truth
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import NEVER, End, Outcome, Received
+from aeroloop.protocol.messages.trace import (
+    ENDS,
+    NEVER,
+    Batch,
+    End,
+    Header,
+    Outcome,
+    Received,
+    Tail,
+    read_batch,
+    read_columns,
+    row_dtype,
+)
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings
 
 Array = npt.NDArray[np.float64]
@@ -73,6 +96,218 @@ class Extent(NamedTuple):
         return self.last["controller"] - self.first["controller"] + 1 if self.rows["controller"] else 0
 
 
+# ── index of the batches ──
+
+_MOST: Final = 1 << 62  # more rows than any process publishes, and more nanoseconds than any clock counts
+
+Ranges = Sequence[tuple[int, int]]  # first and last tick of each
+
+
+class Source(NamedTuple):
+    """A process of an end."""
+
+    vehicle: str
+    end: End
+    run: int
+
+
+class Entry(NamedTuple):
+    """A batch of a trace, as it was recorded."""
+
+    header: Header
+    place: slice  # of its bytes in `TraceIndex.payloads`
+    published_ns: int
+    first: int  # tick of the first row
+    last: int  # highest tick; a late row is of an earlier one
+    proof: int  # a tick of the other end whose row there must be
+    changes: list[Change]
+    record: list[Change]
+
+    @property
+    def after(self) -> int:
+        """Number of the first row after it."""
+        return self.header.first_row + self.header.rows
+
+
+class TraceIndex:
+    """Which batches a run's traces have; after `finish`, also what they lack."""
+
+    def __init__(self) -> None:
+        self.extents: dict[SessionKey, Extent] = {}  # in the order of publication
+        self.missing: list[Missing] = []
+        self.changes: dict[SessionKey, list[Change]] = {}  # of gains and reference, in order
+        self.unknown: list[Unknown] = []  # ticks whose gains, reference or law's state the log does not hold
+        self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)  # of a process, in the order of its rows
+        self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)  # likewise
+        self.payloads = bytearray()  # one object: many small ones would not return 140 MB an hour to the system
+        self.malformed = 0  # batches that are malformed, or of no process of the session
+        self._known: set[int] = set()
+
+    def add(self, vehicle: str, payload: bytes, published_ns: int) -> set[object]:
+        """Add a batch, once; returns its process and session. A malformed one is dropped and counted."""
+        batch = read_batch(payload)
+        if batch is None or max(batch.header.first_row, batch.header.monotonic_ns) >= _MOST:
+            self.malformed += 1
+            return set()
+        header, tail = batch.header, batch.tail
+        source, session = Source(vehicle, header.end, header.run), header.session
+        if (identity := hash((source, payload))) not in self._known:
+            self._known.add(identity)
+            changes = [change for change in tail.changes if change.session == session]
+            record = tail.record if all(change.session == session for change in tail.record) else []
+            place = slice(len(self.payloads), len(self.payloads) + len(payload))
+            self.payloads += payload
+            self.entries[source].append(Entry(header, place, published_ns, *_ticks(batch), changes, record))
+        return {source, (vehicle, session)} if session else {source}
+
+    def finish(self) -> None:
+        """Find sessions, and what the log lacks of them, once all batches are added."""
+        self._sort_out()
+        for source, entries in self.entries.items():
+            for entry in entries:
+                if entry.header.session:
+                    self.parts[(source.vehicle, entry.header.session), source.end].append(entry)
+            self._find_gaps(source, [entry for entry in entries if entry.header.rows or entry.header.final])
+        begun = sorted(self.parts.items(), key=lambda its: min(entry.published_ns for entry in its[1]))
+        for (which, end), part in begun:
+            if having := [entry for entry in part if entry.header.rows]:
+                extent = self.extents.setdefault(which, Extent(*(dict.fromkeys(ENDS, n) for n in (0, NO_TICK, 0))))
+                extent.first[end] = min(entry.first for entry in having)
+                extent.last[end] = max(entry.last for entry in having)
+                extent.rows[end] = sum(entry.header.rows for entry in having)
+        for which, extent in self.extents.items():
+            proofs = {end: max((one.proof for one in self.parts[which, end]), default=NO_TICK) for end in ENDS}
+            for end, other in zip(ENDS, reversed(ENDS), strict=True):
+                if any((m.vehicle, m.session, m.end, m.last_tick) == (*which, end, None) for m in self.missing):
+                    continue
+                proof, last = proofs[other], extent.last[end]
+                if proof > last:  # the other end proves rows after the last one
+                    self._lacks(*which, end, last + 1, proof, proof - last)
+                elif not any(entry.header.final for entry in self.parts[which, end]):
+                    self._lacks(*which, end, last + 1, None, 0)
+            self._find_unknown(which, max(extent.last["controller"], proofs["plant"]))
+
+    def _sort_out(self) -> None:
+        """Put batches in order, without those that overlap others and those of a session that is another process's.
+
+        A process claims a session or grants it, so the one with most of its rows at an end owns it.
+        """
+        rows: defaultdict[tuple[str, End, str], Counter[Source]] = defaultdict(Counter)
+        for source, entries in self.entries.items():
+            after, kept = 0, list[Entry]()
+            # one without rows precedes the batch that starts at the same row
+            for entry in sorted(entries, key=lambda e: (e.header.first_row, e.header.rows > 0, e.header.monotonic_ns)):
+                if not entry.header.rows or entry.header.first_row >= after:
+                    kept.append(entry)
+                    after = max(after, entry.after)
+                    rows[source.vehicle, source.end, entry.header.session][source] += entry.header.rows
+            self.malformed += len(entries) - len(kept)
+            self.entries[source] = kept
+        owners = {which: counts.most_common(1)[0][0] for which, counts in rows.items()}
+        for source, entries in self.entries.items():
+            its = {""} | {session for (*_, session), owner in owners.items() if owner == source}
+            self.entries[source] = [entry for entry in entries if entry.header.session in its]
+            self.malformed += len(entries) - len(self.entries[source])
+
+    def _find_gaps(self, source: Source, having: Sequence[Entry]) -> None:
+        """Find missing rows between the batches of a process that have rows or end a session."""
+        vehicle, end, _ = source
+        if having and (rows := min(having[0].header.first_row, having[0].first)) > 0:
+            self._lacks(vehicle, having[0].header.session, end, 0, having[0].first - 1, rows)
+        for one, following in pairwise(having):
+            rows = following.header.first_row - one.after
+            before, session = one.header.session, following.header.session
+            if rows and before == session:
+                last = following.first - 1 if following.header.rows else None
+                self._lacks(vehicle, session, end, one.last + 1, last, rows)
+            elif rows:
+                head = min(rows, max(0, following.first))  # it has no more rows before than ticks
+                tail = 0 if one.header.final else rows - head  # of the session before, or of others after it
+                if tail:
+                    self._lacks(vehicle, before, end, one.last + 1, None, tail)
+                elif rows > head:
+                    self._lacks(vehicle, "", end, 0, None, rows - head)
+                if head:
+                    self._lacks(vehicle, session, end, 0, following.first - 1, head)
+
+    def _lacks(self, vehicle: str, session: str, end: End, first: int, last: int | None, rows: int) -> None:
+        lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
+        self.missing.append(lacks)
+
+    def _find_unknown(self, which: SessionKey, last_tick: int) -> None:
+        """Find a session's changes, and the ticks up to the last answered one at which they are not known."""
+        entries = [entry for end in ENDS for entry in self.parts[which, end]]
+        self.changes[which] = _changes(entries)
+        records = [(max(change.tick for change in one.record), one.last) for one in entries if _is_whole(one.record)]
+        proven = [(first, max(first, last)) for first, last in records]
+        having = [entry for entry in self.parts[which, "controller"] if entry.header.rows]
+        begun = [change for entry in entries for change in entry.changes if change.tick == 0]
+        # A session whose first row is of a later tick has found no attitude to hold before.
+        if having and having[0].first == 0 and _is_whole(begun):
+            proven.append((0, 0))
+        gaps = [i for i in range(1, len(having)) if having[i].header.first_row > having[i - 1].after]
+        recorded, known = list[tuple[int, int]](), list[tuple[int, int]]()
+        for i, j in pairwise([0, *gaps, len(having)]) if having else ():  # rows without a gap
+            rows = having[i:j]
+            first, last = rows[0].first, max(entry.last for entry in rows)
+            recorded.append((first, last))
+            since = min((max(a, first) for a, b in proven if a <= last and b >= first), default=last + 1)
+            since = next((entry.first for entry in rows if entry.first >= since), last + 1)
+            known.append((since, last))
+        extent = self.extents[which]
+        begin = min(extent.first[end] for end in ENDS if extent.rows[end])
+        if begin > last_tick:
+            return
+        turns = [turn for first, last in (*proven, *recorded, *known) for turn in (first, last + 1)]
+        edges = np.unique(np.clip([begin, *turns, last_tick + 1], begin, last_tick + 1))
+        unknown = ~_within(edges, known) & (_within(edges, recorded) | ~_within(edges, proven))
+        unknown[-1] = False
+        begins, ends = edges[np.flatnonzero(np.diff(unknown, prepend=False))].reshape(-1, 2).T.tolist()
+        for first, last in zip(begins, ends, strict=True):
+            self.unknown.append(Unknown(vehicle=which[0], session=which[1], first_tick=first, last_tick=last - 1))
+
+
+def _ticks(batch: Batch) -> tuple[int, int, int]:
+    """First and last tick of a batch, and a tick that it proves of the other end."""
+    columns, end = batch.columns, batch.header.end
+    if not batch.header.rows:
+        return NO_TICK, NO_TICK, NO_TICK
+    ticks = columns["tick" if end == "controller" else "session_tick"]
+    first, last = int(ticks[0]), int(ticks.max())
+    if end == "controller":
+        return first, last, last if columns["received_as"][-1] == Received.FRAME else NO_TICK
+    answered = int(columns["answered"][-1])
+    return first, last, NO_TICK if answered == NEVER else answered
+
+
+def _changes(entries: Sequence[Entry]) -> list[Change]:
+    """All changes in order: those of the batches, and of records those that no batch has."""
+    found = [change for entry in entries for change in entry.changes]
+    had = {(change.tick, part) for change in found for part in _parts(change)}
+    for change in (change for entry in entries for change in entry.record):
+        if not had.issuperset(its := {(change.tick, part) for part in _parts(change)}):
+            had |= its
+            found.append(change)
+    return sorted(found, key=lambda change: change.tick)
+
+
+def _parts(change: Change) -> list[str]:
+    return [name for name in ("gains", "reference") if getattr(change, name) is not None]
+
+
+def _is_whole(changes: Iterable[Change]) -> bool:
+    return {part for change in changes for part in _parts(change)} == {"gains", "reference"}
+
+
+def _within(ticks: Integers, ranges: Ranges) -> npt.NDArray[np.bool_]:
+    """Whether any range has each tick."""
+    firsts, lasts = np.array(ranges, np.int64).reshape(-1, 2).T
+    return np.searchsorted(np.sort(firsts), ticks, "right") > np.searchsorted(np.sort(lasts), ticks, "left")
+
+
+# ── tables ──
+
+
 @dataclass(frozen=True)
 class Session:
     """Both ends' rows of a session in order, and their join on the tick. Rows of unknown ticks are left out.
@@ -94,6 +329,39 @@ class Session:
     at_controller: Places  # index of the controller's row that computed each tick, or −1. Shape (n,)
     at_plant: Places  # index of the plant's row of each tick, or −1. Shape (n,)
     acted: Places  # index of the plant's row that first acted on the command that answers it, or −1. Shape (n,)
+
+
+def table_of(
+    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: bytearray
+) -> tuple[Table, dict[int, dict[str, Any]], int]:
+    """One end's rows, from batches in order.
+
+    Returns:
+        The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
+    """
+    kinds = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
+    fitting = [one for one in entries if one.header.row_dtype == kinds]
+    columns = [name for name in kinds.names or () if name != "voltages"]
+    wide = {"tick", "session_tick", "answered", "received", "sent", "wall"}
+    form = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in (*columns, "wall")]
+    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype(form))
+    states = dict[int, dict[str, Any]]()
+    filled, next_row = 0, -1
+    for header, place, *_ in fitting:
+        payload = bytes(payloads[place])
+        batch = Batch(header, read_columns(header, payload), Tail())
+        if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
+            states[filled] = whole.tail.state
+        next_row = header.first_row + header.rows
+        rows = table[filled : filled + header.rows]
+        for name in columns:
+            rows[name] = batch.columns[name]
+        rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
+        rows["wall"] = header.wall_ns - header.monotonic_ns
+        filled += header.rows
+    if end == "plant":
+        table["answered"][table["answered"] == NEVER] = NO_TICK
+    return table, states, len(entries) - len(fitting)
 
 
 def join(

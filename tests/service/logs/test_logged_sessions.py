@@ -29,8 +29,7 @@ from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.logs.session import Missing
-from aeroloop.service.logs.trace_index import TraceIndex
+from aeroloop.service.logs.session import Missing, TraceIndex
 from aeroloop.service.review.review import read, review
 from tests.support.edited_log import contents, edited, rewrite, write_messages
 from tests.support.made_log import (
