@@ -339,7 +339,7 @@ def table_of(
     Returns:
         The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
-    kinds = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
+    kinds = row_dtype(end, wire.actuators, wire.measurement.size, wire.command.size)
     fitting = [one for one in entries if one.header.row_dtype == kinds]
     columns = [name for name in kinds.names or () if name != "voltages"]
     wide = {"tick", "session_tick", "answered", "received", "sent", "wall"}
