@@ -217,7 +217,7 @@ def live(
 @group.command()
 def export(
     logs: Logs,
-    form: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--format", help="Format of the new file.")],
+    form: Annotated[Literal["parquet", "csv", "mcap"], typer.Option("--format", help="Format of the new file.")],
     out: Annotated[
         Path | None, typer.Option("--out", help="The new file; the log's name with another suffix if left out.")
     ] = None,

@@ -1,7 +1,7 @@
 """Copies of a log: what can be read of a broken one, and a run with every message decoded.
 
-A copy has its own ids; messages keep their topic, schema, times and sequence. What several files repeat is written
-once: schemas, channels, attachments, and a metadata record that equals the last one of its name and key.
+A copy has its own ids; messages keep their topic, schema, times and sequence. Schemas, channels and attachments that
+several files repeat are written once.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, NotMcapError, records
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, NotMcapError, records
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 
@@ -41,9 +41,7 @@ class Recovery(BaseModel, frozen=True):
 def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
     """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
 
-    Raises:
-        OutputError: The new file must not be written, or cannot.
-        RecoverError: It is not an MCAP file, or cannot be read.
+    Raises OutputError if the new file must not be written, or cannot; RecoverError if there is nothing to recover.
     """
     try:
         broken.stat()
@@ -63,11 +61,7 @@ def write_decoded(
 ) -> tuple[int, list[str], list[str]]:
     """Write a run as one log with every message decoded, which the recorder does at a bounded rate only.
 
-    Returns:
-        How many messages were written, their topics, and what of the log could not be read, a line each.
-
-    Raises:
-        OSError: It cannot be written.
+    Returns how many messages were written, their topics, and what could not be read. Raises OSError.
     """
     from aeroloop.service.viewers.channels import Decoder
 
@@ -84,25 +78,20 @@ def _copy(
 ) -> tuple[int, list[str], list[str]]:
     """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
 
-    Returns:
-        How many messages were written, their topics, and what could not be read, a line each.
-
-    Raises:
-        NotMcapError: A file is not an MCAP file.
-        OSError: A file cannot be read, or the new one cannot be written.
+    Returns how many messages were written, their topics, and what could not be read, a line each. Raises NotMcapError,
+    and OSError if a file cannot be read or the new one cannot be written.
     """
     messages, done, size = 0, 0, max(1, sum(path.stat().st_size for path in paths))
-    names, damages = set[str](), list[str]()
-    attachments, last = set[tuple[str, bytes]](), dict[tuple[str, str | None], dict[str, str]]()
+    names, attached, damages = set[str](), set[str](), list[str]()
     with out.open("wb") as file:
         writer = Writer(file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         writer.start(profile="aeroloop", library=program)
         schema_id = cache(writer.register_schema)
 
         @cache
-        def channel_id(topic: str, encoding: str, schema: int, metadata: tuple[tuple[str, str], ...] = ()) -> int:
+        def channel_id(topic: str, encoding: str, schema: int) -> int:
             names.add(topic)
-            return writer.register_channel(topic, encoding, schema, dict(metadata))
+            return writer.register_channel(topic, encoding, schema)
 
         for path in paths:
             schemas, channels = {0: 0}, dict[int, tuple[int, str]]()  # by the ids of this file
@@ -120,23 +109,19 @@ def _copy(
                         decoded = decoder.take(address, record.data, record.publish_time) if decoder and address else []
                         for topic, shape, data, at_ns in decoded:  # log time is that of publication, as recorded
                             schema = schema_id(shape.name, shape.encoding, shape.schema)
-                            channel = channel_id(topic, shape.message_encoding, schema)
-                            writer.add_message(channel, at_ns, data, at_ns)
+                            writer.add_message(channel_id(topic, shape.message_encoding, schema), at_ns, data, at_ns)
                         messages += 1 + len(decoded)
                     case Schema():
                         schemas[record.id] = schema_id(record.name, record.encoding, record.data)
-                    case Channel(id_, topic, encoding, metadata, schema) if not (decoder and topic.startswith("/")):
-                        known = channel_id(topic, encoding, schemas.get(schema, 0), tuple(metadata.items()))
-                        channels[id_] = known, topic
-                    case Metadata(name=name, metadata=entries) if last.get((name, entries.get("key"))) != entries:
-                        last[name, entries.get("key")] = entries
-                        writer.add_metadata(name, entries)
-                    case Attachment(created, logged, name, kind, data) if (name, data) not in attachments:
-                        attachments.add((name, data))
-                        writer.add_attachment(created, logged, name, kind, data)
+                    case Channel(id_, topic, encoding, _, schema) if not (decoder and topic.startswith("/")):
+                        channels[id_] = channel_id(topic, encoding, schemas.get(schema, 0)), topic
+                    case Metadata():
+                        writer.add_metadata(record.name, record.metadata)
+                    case Attachment() if record.name not in attached:
+                        attached.add(record.name)
+                        writer.add_attachment(
+                            record.create_time, record.log_time, record.name, record.media_type, record.data
+                        )
             done += path.stat().st_size
-        for (name, _), entries in last.items():  # descriptions also stand at the end, as the recorder writes them
-            if name == DESCRIPTION_METADATA:
-                writer.add_metadata(name, entries)
         writer.finish()
     return messages, sorted(names), damages

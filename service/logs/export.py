@@ -1,9 +1,9 @@
 """Export of a log as a table, or as a log with everything decoded.
 
 A table has a row for each tick that a review judges: what the controller received and computed at it (see `Ticks`), and
-the emulator's latest truth. All formats have the same columns by the same names, each ending in its unit. Parquet has
-each column's unit and description in its field's metadata, and the configuration in the file's; a MATLAB file has them
-in the fields `units`, `descriptions` and `config` of its struct; CSV has a header row only, and 1 and 0 for booleans.
+the emulator's latest truth. Parquet and CSV have the same columns by the same names, each ending in its unit. Parquet
+has each column's unit and description in its field's metadata, and the configuration in the file's; CSV has a header
+row only, and 1 and 0 for booleans.
 """
 
 from __future__ import annotations
@@ -32,23 +32,12 @@ from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import Array, SessionKey, TrueStates, Unknown
 from aeroloop.service.logs.ticks import Ticks, euler_deg, recompute
 
-Format = Literal["parquet", "csv", "mat", "mcap"]
+Format = Literal["parquet", "csv", "mcap"]
 
-AT_A_TIME: Final = 1 << 16
-"""Rows that are turned into columns at a time."""
-
-MAT_LIMIT: Final = 2**31 - 1
-"""Bytes that a variable of a MATLAB v5 file may have."""
-
-
-Kind = Literal["double", "int64", "int8", "bool", "string"]
-"""Type of a column's values, by Arrow's name."""
-
+AT_A_TIME: Final = 1 << 16  # rows that are turned into columns at a time
 AXES: Final = ("x", "y", "z")
 EULER: Final = ("roll", "pitch", "yaw")
-
-_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})
-"""Characters of a unit in a column's name."""
+_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})  # of a unit in a column's name
 
 
 class ExportError(AeroloopError):
@@ -83,22 +72,18 @@ def export(
 ) -> Exported:
     """Write a run's ticks as a table, or all of it as a log with everything decoded.
 
-    Args:
-        paths: Logs, folders of logs, or the files of a rotated run.
-        to: Format.
-        out: The file; the first log's name with another ending if None.
-        session: As of `Recording.choose`, or `all` of the vehicle.
-        vehicle: As of `Recording.choose`.
-        since_s: From when on, on the law's clock [s].
-        until_s: Until when [s].
-        force: Replace an existing file, unless it is a log.
-        progress: Called repeatedly with the share done, 0…1.
+    The new file has the first log's name with another ending if `out` is None. Session and vehicle are as of
+    `Recording.choose`, or all sessions of the vehicle; times are the law's.
 
     Raises:
         ExportError: There is nothing to export.
         OutputError: The file must not be written, or cannot.
         ReviewError: The log cannot be read.
     """
+    if to == "mcap" and (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
+        raise ExportError(
+            "--session, --vehicle, --from and --to choose the rows of a table; --format mcap writes all of the log"
+        )
     log = paths[0].resolve() if paths[0].is_dir() else paths[0]  # "." has no name
     stem = log.name if log.is_dir() else log.stem
     out = out or log.with_name(stem + ("-decoded.mcap" if to == "mcap" else f".{to}"))
@@ -107,11 +92,6 @@ def export(
         with writing(out, paths, force=force) as part:
             recording = Recording(paths, progress)
             if to == "mcap":
-                if (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
-                    raise ExportError(
-                        "--session, --vehicle, --from and --to choose the rows of a table; --format mcap writes all of "
-                        "the log"
-                    )
                 rows, columns, damages = write_decoded(recording, part, progress)
             else:
                 first = recording.choose(None if session == "all" else session, vehicle)
@@ -155,14 +135,23 @@ def _write_table(
     if (first := next(pieces, None)) is None:
         raise ExportError(f"{recording.name} has no answered measurement to export")
     fields = [
-        pa.field(
-            column.name, pa.type_for_alias(column.kind), True, {"unit": column.unit, "description": column.description}
-        )
+        pa.field(column.name, _array(column).type, True, {"unit": column.unit, "description": column.description})
         for column in first
     ]
     schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
-    batches = (pa.RecordBatch.from_arrays(list(map(_values, one)), schema=schema) for one in chain([first], pieces))
-    rows = _write_mat(part, schema, batches) if to == "mat" else _write_arrow(part, schema, batches, csv=to == "csv")
+    if to == "csv":  # RFC 4180; numbers have all their digits. A reader takes `true` beside an empty cell for text
+        schema = pa.schema([field.with_type(pa.int8()) if field.type == pa.bool_() else field for field in schema])
+        options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
+        writer: Any = pyarrow.csv.CSVWriter(part, schema, write_options=options)
+    else:  # a dictionary of doubles makes the file a third larger and its writing slower, quantized or not
+        texts = [field.name for field in schema if field.type == pa.string()]
+        writer = pyarrow.parquet.ParquetWriter(part, schema, compression="zstd", use_dictionary=texts)
+    rows = 0
+    with writer:
+        for one in chain([first], pieces):
+            batch = pa.RecordBatch.from_arrays([*map(_array, one)], [column.name for column in one])
+            writer.write_batch(batch.cast(schema))
+            rows += len(batch)
     damages = [*recording.unread, *([f"malformed: {malformed} of truth"] if malformed else [])]
     return rows, [column.name for column in first], damages
 
@@ -199,7 +188,7 @@ class Column(NamedTuple):
     unit: str
     description: str
     values: npt.NDArray[Any]
-    kind: Kind = "double"
+    boolean: bool = False  # 1.0 and 0.0
 
 
 def columns_of(
@@ -217,12 +206,11 @@ def columns_of(
     received = np.where(ticks.attitude[:, :1] == 0.0, np.nan, ticks.attitude[:, 1:])
     lengths = np.sqrt(np.sum(np.square(ticks.attitude_error), axis=1))
     found = [
-        Column("tick", "", "tick k of the law", ticks.k, "int64"),
+        Column("tick", "", "tick k of the law", ticks.k),
         Column("time_s", "s", "the law's time, k times the period", ticks.k * period),
-        Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", ticks.wall_ns,
-               "int64"),
-        Column("vehicle", "", "name of the vehicle", np.full(n, which[0], dtype=object), "string"),
-        Column("session", "", "name of the session", np.full(n, which[1], dtype=object), "string"),
+        Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", ticks.wall_ns),
+        Column("vehicle", "", "name of the vehicle", np.full(n, which[0], dtype=object)),
+        Column("session", "", "name of the session", np.full(n, which[1], dtype=object)),
         *_attitude("", "as measured", ticks.attitude),
         *_attitude("desired_", "as desired", ticks.desired),
         *_by("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", ticks.rate, AXES),
@@ -238,11 +226,11 @@ def columns_of(
                ticks.measurement_delay_ns * 1e-3),
         Column("command_delay_us", "µs", "from the controller to the plant, likewise", ticks.command_delay_ns * 1e-3),
         *_by("saturated_attitude_{}", "", "whether ε has the quantizer's outermost level, {}; unknown where η = 0",
-             _reaches(received, outermost["attitude"]), AXES, "bool"),
+             _reaches(received, outermost["attitude"]), AXES, True),
         *_by("saturated_rate_{}", "", "whether ω has the quantizer's outermost level, {}",
-             _reaches(ticks.rate, outermost["rate"]), AXES, "bool"),
+             _reaches(ticks.rate, outermost["rate"]), AXES, True),
         *_by("saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
-             _reaches(ticks.voltages, outermost["voltage"]), motors, "bool"),
+             _reaches(ticks.voltages, outermost["voltage"]), motors, True),
     ]  # fmt: skip
     law, since = law_of(settings.law, period, wire.actuators), 0
     for name, initial in initial_state(law).items():
@@ -264,10 +252,10 @@ def columns_of(
     ]
 
 
-def _by(name: str, unit: str, what: str, values: Array, axes: Sequence[str], kind: Kind = "double") -> Iterator[Column]:
+def _by(name: str, unit: str, what: str, values: Array, axes: Sequence[str], boolean: bool = False) -> Iterator[Column]:
     """A column per axis, which replaces the braces in its name and description."""
     for axis, column in zip(axes, values.T, strict=True):
-        yield Column(name.format(axis), unit, what.format(axis), column, kind)
+        yield Column(name.format(axis), unit, what.format(axis), column, boolean)
 
 
 def _attitude(prefix: str, which: str, q: Array) -> Iterator[Column]:
@@ -280,63 +268,7 @@ def _reaches(values: Array, level: float) -> Array:
     return np.where(np.isnan(values), np.nan, np.abs(values) >= level)
 
 
-# ── files ──
-
-
-def _values(column: Column) -> Any:
+def _array(column: Column) -> Any:
     """A column of an Arrow table; NaN is null."""
-    values = column.values
-    gaps = np.isnan(values) if values.dtype == np.float64 else None
-    if column.kind == "bool":
-        values = np.nan_to_num(values).astype(np.bool_)
-    return pa.array(values, pa.type_for_alias(column.kind), mask=gaps)
-
-
-def _write_arrow(path: Path, schema: Any, batches: Iterator[Any], *, csv: bool) -> int:
-    """Write Parquet or CSV; returns the number of rows.
-
-    CSV is as of RFC 4180. A number has enough digits to be read back exactly; a missing one is empty. Its booleans are
-    numbers: a reader that guesses types takes `true` beside an empty cell for text.
-    """
-    if csv:
-        schema = pa.schema([field.with_type(pa.int8()) if field.type == pa.bool_() else field for field in schema])
-        options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
-        writer: Any = pyarrow.csv.CSVWriter(path, schema, write_options=options)
-    else:  # a dictionary of doubles makes the file a third larger and its writing slower, quantized or not
-        texts = [field.name for field in schema if field.type == pa.string()]
-        writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
-    rows = 0
-    with writer:
-        for batch in batches:
-            writer.write_batch(batch.cast(schema))
-            rows += len(batch)
-    return rows
-
-
-def _write_mat(path: Path, schema: Any, batches: Iterator[Any]) -> int:
-    """Write a struct `aeroloop`, with a column vector of doubles for each column; returns the number of rows.
-
-    Missing values are NaN. `published_ns` is int64, as a double does not hold it. `vehicle` and `session` are numbers,
-    from 1, into the lists `vehicles` and `sessions`.
-    """
-    import scipy.io  # slow to import, and needed here only
-
-    table, struct = pa.Table.from_batches(batches, schema), dict[str, Any]()
-    for field, column in zip(schema, table.columns, strict=True):
-        if field.type == pa.string():
-            texts = column.combine_chunks().dictionary_encode()
-            struct[f"{field.name}s"] = np.array(texts.dictionary.to_pylist(), dtype=object)
-            column = pa.array(texts.indices.to_numpy() + 1)
-        struct[field.name] = column.cast(pa.int64() if field.name == "published_ns" else pa.float64()).to_numpy()
-    if (size := sum(values.nbytes for values in struct.values())) > MAT_LIMIT:
-        raise ExportError(
-            f"a MATLAB file holds 2 GiB, and these rows take {size / 2**30:.1f} GiB; use --format parquet, "
-            "which MATLAB reads by parquetread"
-        )
-    for name in ("unit", "description"):
-        struct[f"{name}s"] = {field.name: field.metadata[name.encode()].decode() for field in schema}
-    facts = {key.decode().removeprefix("aeroloop."): value.decode() for key, value in schema.metadata.items()}
-    struct |= {name: fact for name, fact in facts.items() if name not in struct}
-    with path.open("wb") as file:
-        scipy.io.savemat(file, {"aeroloop": struct}, long_field_names=True, oned_as="column")
-    return int(table.num_rows)
+    values = pa.array(column.values, from_pandas=True)
+    return values.cast(pa.bool_()) if column.boolean else values

@@ -34,17 +34,10 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-DESCRIPTION_METADATA: Final = "aeroloop.description"
-"""Name of the metadata record with a role's description, as JSON under `json`, and its key under `key`."""
-
-RECORDER_METADATA: Final = "aeroloop.recorder"
-"""Name of the metadata record about the file itself: its run, the recording's identity, its part, its beginning."""
-
-CHUNK_BYTES: Final = 64 * 1024
-"""A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
-
-MAX_CHUNK: Final = 16 << 20
-"""Bytes that a record or the content of a chunk may have: a forged size costs no memory."""
+DESCRIPTION_METADATA: Final = "aeroloop.description"  # a role's description as JSON under `json`, its key under `key`
+RECORDER_METADATA: Final = "aeroloop.recorder"  # about the file: its run, the recording's identity, its part, its start
+CHUNK_BYTES: Final = 64 * 1024  # compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once
+MAX_CHUNK: Final = 16 << 20  # bytes of a record, or of what a chunk holds: a forged size costs no memory
 
 _CHECKSUM: Final = "crc32"
 _HEAD: Final = struct.Struct("<BQ")  # opcode and length of a record
@@ -61,16 +54,9 @@ def records(
 ) -> Iterator[McapRecord]:
     """Schemas, channels, messages, metadata and attachments in the file's order; damaged ones are left out.
 
-    Schemas and channels of an index come first, so that a damaged chunk loses no other chunk's description.
-
-    Args:
-        path: The file.
-        damages: What could not be read is appended, each with its byte and the time of the last message before it.
-        progress: Called after each record of the file with the bytes read so far.
-
-    Raises:
-        NotMcapError: It is no MCAP file.
-        OSError: It cannot be read.
+    Schemas and channels of an index come first, so that a damaged chunk loses no other chunk's description. What could
+    not be read is appended to `damages`, each with its byte and the time of the last message before it; `progress` is
+    called with the bytes read so far. Raises NotMcapError, or OSError if the file cannot be read.
     """
     last_ns = 0
     with path.open("rb") as file:
@@ -78,7 +64,7 @@ def records(
             raise NotMcapError(f"{path} does not begin as an MCAP file")
         index = _index(file)
         yield from (one for one in index or () if isinstance(one, (Schema, Channel)))
-        for at, opcode in _from_the_front(file) if index is None else _by_index(index):
+        for at, opcode in _places(file, index):
             try:
                 record = _record(file, at, opcode)
                 found = _contents(record) if isinstance(record, Chunk) else [record]
@@ -115,17 +101,15 @@ def _index(file: BinaryIO) -> list[McapRecord] | None:
     return None
 
 
-def _by_index(index: list[McapRecord]) -> list[tuple[int, int]]:
-    """Offset and opcode of each record that the index leads to, in the file's order."""
-    places = [(one.chunk_start_offset, Opcode.CHUNK) for one in index if isinstance(one, ChunkIndex)]
-    places += [(one.offset, Opcode.METADATA) for one in index if isinstance(one, MetadataIndex)]
-    return sorted([*places, *((one.offset, Opcode.ATTACHMENT) for one in index if isinstance(one, AttachmentIndex))])
-
-
-def _from_the_front(file: BinaryIO) -> Iterator[tuple[int, None]]:
-    """Where each record of the data section begins: after the one before."""
+def _places(file: BinaryIO, index: list[McapRecord] | None) -> Iterator[tuple[int, int | None]]:
+    """Where each record begins, in the file's order, and its opcode: by the index, else each after the one before."""
+    if index is not None:
+        places = [(one.chunk_start_offset, Opcode.CHUNK) for one in index if isinstance(one, ChunkIndex)]
+        places += [(one.offset, Opcode.METADATA) for one in index if isinstance(one, MetadataIndex)]
+        places += [(one.offset, Opcode.ATTACHMENT) for one in index if isinstance(one, AttachmentIndex)]
+        yield from sorted(places)
     at = len(MAGIC)
-    while True:
+    while index is None:
         yield at, None
         at = file.tell()
 

@@ -6,7 +6,6 @@ messages stay in memory, until `release`.
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil, inf
@@ -14,32 +13,28 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcap.records import Channel, Message, Metadata
+from pydantic_core import from_json
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS, Batch, End, read_batch
+from aeroloop.protocol.messages.trace import ENDS, Batch, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
-from aeroloop.service.logs.session import Session, SessionKey, join, table_of
-from aeroloop.service.logs.trace_index import Source, TraceIndex
+from aeroloop.service.logs.session import Entry, Session, SessionKey, Source, TraceIndex, join, table_of
 
-Progress = Callable[[float], None]
-"""Called repeatedly with the share done, 0…1."""
+Progress = Callable[[float], None]  # called repeatedly with the share done, 0…1
 
-INDEXING: Final = 0.4
-"""Share of the progress that reading the files takes."""
-
-ANSWER_S: Final = 1.2
-"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
-
+INDEXING: Final = 0.4  # share of the progress that reading the files takes
+ANSWER_S: Final = 1.2  # longest time from a measurement until its command acts; a session's first may take a second
+MESSAGES: Final = ("event", "loss", "status", "truth")  # whose messages are read beside the traces
 OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
 """Sections of the configuration by the role that owns them; the others are the controller's. Why: every process is
 configured by itself: the controller's copy of `plant.mass` may differ from the plant's."""
 
-MESSAGES: Final = ("event", "loss", "status", "truth")
-"""Topics whose messages are read beside the traces."""
+_Copy = tuple[Path, int, str | bytes, Address | None]
+"""A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
 
 
 class ReviewError(AeroloopError):
@@ -47,47 +42,35 @@ class ReviewError(AeroloopError):
 
 
 class Recording:
-    """The logs of a run.
-
-    Args:
-        paths: Files and folders; of a folder, every `.mcap` in it.
-        progress: Called repeatedly with the share done: reading the files takes `INDEXING` of it.
-
-    Attributes:
-        paths: The files, in the order of their first messages.
-        metadata: Metadata that are no descriptions, by name without prefix (`aeroloop.recorder` is `recorder`).
-        extents: Recorded extent of each session, in the order of recording.
-        missing: Rows that the log lacks.
-        unknown: Ticks that `session` leaves out, as the log does not hold what was in force then.
-        messages: Messages of the topics MESSAGES with their keys, in the order of recording.
-        damaged: What of the files is cut or damaged, a line each.
-        malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
+    """The logs of a run, from files and folders; of a folder, every `.mcap` in it.
 
     Raises:
         ReviewError: There is no log, it cannot be read, has another version of the protocol, or is of another run.
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
-        self.metadata: dict[str, dict[str, Any]] = {}
-        self.messages: list[tuple[Address, Message]] = []
-        self.damaged: list[str] = []
-        self.malformed: Counter[str] = Counter()
+        self.metadata: dict[str, dict[str, Any]] = {}  # but descriptions, by name without its prefix `aeroloop.`
+        self.messages: list[tuple[Address, Message]] = []  # of the topics MESSAGES, in the order of recording
+        self.damaged: list[str] = []  # what of the files is cut or damaged, a line each
+        self.malformed: Counter[str] = Counter()  # messages by topic; they cost nothing else
         self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
-        self._begun_ns: dict[Source | tuple[SessionKey, End], int] = {}  # first publication of rows
         self._index = TraceIndex()
-        begins_ns = {path: _begin_ns(path) for path in _files(paths)}
-        self.paths = sorted(begins_ns, key=begins_ns.__getitem__)
-        size, done = max(1, sum(path.stat().st_size for path in self.paths)), 0
-        copies = list[_Copy]()
-        marks = dict[Path, set[object]]()
-        for path in self.paths:
+        begins_ns, marks, copies = dict[Path, int](), dict[Path, set[object]](), list[_Copy]()
+        try:
+            sizes, done = {path: path.stat().st_size for path in _files(paths)}, 0
+            for path, size in sizes.items():
 
-            def report(read: int, before: int = done) -> None:
-                if progress is not None:
-                    progress(INDEXING * (before + read) / size)
+                def report(read: int, before: int = done) -> None:
+                    if progress is not None:
+                        progress(INDEXING * (before + read) / max(1, sum(sizes.values())))
 
-            marks[path] = self._read(path, report, copies)
-            done += path.stat().st_size
+                begins_ns[path], marks[path] = self._read(path, report, copies)
+                done += size
+        except NotMcapError as error:
+            raise ReviewError(f"{error}, so it is no log") from None
+        except OSError as error:
+            raise ReviewError(f"cannot read {error.filename or paths[0]}: {error.strerror}") from None
+        self.paths = sorted(begins_ns, key=begins_ns.__getitem__)  # in the order of their first messages
         _check_that_all_are_of_one_run(marks)
         self._add_descriptions(copies)
         self._index.finish()
@@ -107,12 +90,10 @@ class Recording:
     # ── sessions ──
 
     def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
-        """A session. Raises ReviewError if there is none.
+        """A session by its name or number, and its vehicle. Raises ReviewError if there is none.
 
-        Args:
-            session: Its name, alone or as `vehicle/session`, or its number, from 1 in the order of recording; the one
-                with the most ticks if None.
-            vehicle: Its vehicle; any if None, and that of the longest session for a number.
+        Numbers count from 1 in the order of recording, by default of the longest session's vehicle. Without session it
+        is the longest.
         """
         if not self.extents:
             raise ReviewError(f"{self.name} holds no session: no trace of a controller or a plant was recorded")
@@ -124,9 +105,8 @@ class Recording:
         if session is None:
             return longest
         numbered = self.sessions_of(longest[0])
-        named = {str(i): which for i, which in enumerate(numbered, 1)}
-        for which in reversed(known):
-            named |= {which[1]: which, "/".join(which): which}
+        named = {name: which for which in reversed(known) for name in (which[1], "/".join(which))}
+        named = {str(i): which for i, which in enumerate(numbered, 1)} | named
         if session in named:
             return named[session]
         names = ", ".join(f"{i} {which[1]}" for i, which in enumerate(numbered[:20], 1))
@@ -155,10 +135,10 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
-        payloads = memoryview(self._index.payloads)
+        payloads = self._index.payloads
+        acting = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
         controller, states, left_out = table_of("controller", settings.wire, computed, payloads)
-        its = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
-        plant, _, more_left_out = table_of("plant", settings.wire, its, payloads)
+        plant, _, more_left_out = table_of("plant", settings.wire, acting, payloads)
         self.malformed["trace"] += left_out + more_left_out
         for gap in unknown:
             plant = plant[(plant["session_tick"] < gap.first_tick) | (plant["session_tick"] > gap.last_tick)]
@@ -176,6 +156,18 @@ class Recording:
             *join(controller, plant, first, last),
         )
 
+    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
+        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
+        for source, entries in self._index.entries.items():
+            if source.end == "plant" and entries:
+                payloads = (bytes(self._index.payloads[entry.place]) for entry in entries)
+                batches = [batch for payload in payloads if (batch := read_batch(payload)) is not None]
+                yield source, self._described_before(source.vehicle, "plant", entries), batches
+
+    def release(self) -> None:
+        """Free batches and messages, once all that is wanted of them is read: no other session can be read then."""
+        self._index, self.messages = TraceIndex(), []
+
     # ── descriptions ──
 
     @property
@@ -189,7 +181,7 @@ class Recording:
         found = {role: last for (_, role), last in known if role == "recorder"}
         found |= {role: last for (vehicle, role), last in known if vehicle == which[0]}
         for end in ENDS:
-            if its := self._described_at(which[0], end, self._begun_ns.get((which, end))):
+            if its := self._described_before(which[0], end, self._index.parts[which, end]):
                 found[end] = its
         return found
 
@@ -211,33 +203,46 @@ class Recording:
         owned = {section: getattr(its, section) for role, its in owners.items() for section in OWNED[role]}
         return from_description(config).model_copy(update=owned)  # not validated again: each role ran by its own
 
-    def _described_at(self, vehicle: str, role: str, at_ns: int | None) -> Description | None:
-        """The last description that a role published before a time [ns since 1970]; else its first."""
+    def _described_before(self, vehicle: str, role: str, entries: Sequence[Entry]) -> Description | None:
+        """The last description that a role published before these batches; else its first."""
         found = self._descriptions.get((vehicle, role))
-        if found is None or at_ns is None:
+        if found is None or not entries:
             return None
-        return next((one for said_ns, one in reversed(found) if 0 < said_ns <= at_ns), found[0][1])
+        begun_ns = min(entry.published_ns for entry in entries)
+        return next((one for at_ns, one in reversed(found) if 0 < at_ns <= begun_ns), found[0][1])
 
-    # ── the plant's processes ──
+    def _add_descriptions(self, copies: Sequence[_Copy]) -> None:
+        """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
 
-    def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
-        """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
-        for source, entries in self._index.entries.items():
-            if source.end == "plant" and entries:
-                payloads = (bytes(self._index.payloads[one.place]) for one in entries)
-                batches = [batch for payload in payloads if (batch := read_batch(payload)) is not None]
-                yield source, self._described_at(source.vehicle, "plant", self._begun_ns[source]), batches
+        One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
+        end it is a damage. Why: without it, the other end's configuration stands for it.
+        """
+        unreadable = list[tuple[Path, int, Address | None, str]]()
+        for path, at_ns, text, address in sorted(copies, key=lambda one: one[1]):
+            try:
+                found = _read_description(text, address)
+                self._descriptions[found.vehicle, found.role].append((at_ns, found))
+            except ValueError as error:
+                unreadable.append((path, at_ns, address, str(error).splitlines()[0]))
+        if unreadable and not self._descriptions:
+            raise ReviewError(f"{unreadable[0][0]} is not a log of this version: {unreadable[0][3]}")
+        for path, at_ns, address, why in unreadable:
+            known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
+            if at_ns and known:
+                self.malformed["description"] += 1
+            else:
+                self.damaged.append(f"{path}: a description: {why}")
 
-    def release(self) -> None:
-        """Free batches and messages, once all that is wanted of them is read: no other session can be read then."""
-        self._index, self.messages = TraceIndex(), []
+    # ── files ──
 
-    # ── the look at the files ──
+    def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> tuple[int, set[object]]:
+        """Read a file's metadata, descriptions and traces.
 
-    def _read(self, path: Path, progress: Callable[[int], None], copies: list[_Copy]) -> set[object]:
-        """Read a file's metadata, descriptions and traces; returns what marks its run, nothing without a trace."""
+        Returns:
+            When its first message was recorded [ns since 1970], and what marks its run: nothing without a trace.
+        """
         addresses: dict[int, Address | None] = {}
-        marks, damages = set[object](), list[str]()
+        begin_ns, marks, damages = 0, set[object](), list[str]()
         identity: object = path
         for record in records(path, damages, progress):
             match record:
@@ -247,55 +252,26 @@ class Recording:
                     copies.append((path, 0, entries.get("json", ""), topics.read_key(entries.get("key", ""))))
                 case Metadata(name=name, metadata=entries) if name.startswith("aeroloop."):
                     try:
-                        content = json.loads(entries.get("json", "{}"))
-                    except (ValueError, RecursionError) as error:
+                        content = from_json(entries.get("json", "{}"))
+                    except ValueError as error:
                         damages.append(f"metadata {name}: {str(error).splitlines()[0]}")
-                        continue
+                        content = None
                     if isinstance(content, dict):
                         self.metadata[name.removeprefix("aeroloop.")] = content
                         if name == RECORDER_METADATA and isinstance(content.get("id"), str):
                             identity = content["id"]
-                case Message() if (address := addresses.get(record.channel_id)) is not None:
+                case Message(publish_time=at_ns, data=data):
+                    begin_ns = begin_ns or record.log_time
+                    if (address := addresses.get(record.channel_id)) is None:
+                        continue
                     if address.topic.name == "description":
-                        copies.append((path, record.publish_time, record.data, address))
-                    elif address.topic.name == "trace" and (found := self._index.add(address.vehicle, record.data)):
-                        source, session = found
-                        which = address.vehicle, session
-                        marks |= {source, which} if session else {source}
-                        for one in (source, (which, source.end)):
-                            self._begun_ns[one] = min(self._begun_ns.get(one, record.publish_time), record.publish_time)
+                        copies.append((path, at_ns, data, address))
+                    elif address.topic.name == "trace":
+                        marks |= self._index.add(address.vehicle, data, at_ns)
                     elif address.topic.name in MESSAGES:
                         self.messages.append((address, record))
         self.damaged += [f"{path}: {damage}" for damage in damages]
-        return marks and {*marks, identity}
-
-    def _add_descriptions(self, copies: Sequence[_Copy]) -> None:
-        """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
-
-        One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
-        end it is a damage. Why: without it, the other end's configuration stands for it.
-        """
-        unreadable = list[tuple[_Copy, str]]()
-        for copy in sorted(copies, key=lambda one: one[1]):
-            try:
-                found = _read_description(copy[2], copy[3])
-            except ValueError as error:
-                unreadable.append((copy, str(error).splitlines()[0]))
-            else:
-                self._descriptions[found.vehicle, found.role].append((copy[1], found))
-        if unreadable and not self._descriptions:
-            (path, *_), why = unreadable[0]
-            raise ReviewError(f"{path} is not a log of this version: {why}")
-        for (path, at_ns, _, address), why in unreadable:
-            known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
-            if at_ns and known:
-                self.malformed["description"] += 1
-            else:
-                self.damaged.append(f"{path}: a description: {why}")
-
-
-_Copy = tuple[Path, int, str | bytes, Address | None]
-"""A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
+        return begin_ns, marks and {*marks, identity}
 
 
 def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
@@ -303,16 +279,15 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
 
     Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
     """
-    runs: list[tuple[set[object], list[Path]]] = []
-    for path, its in marks.items():
-        if its:  # else it has no trace to be mixed with others
-            related = [run for run in runs if run[0] & its]
-            paths = [one for run in related for one in run[1]]
-            runs = [run for run in runs if run not in related]
-            runs.append((its.union(*(run[0] for run in related)), [*paths, path]))
+    left = {path: its for path, its in marks.items() if its}  # one without a trace cannot be mixed with others
+    runs: list[Path] = []
+    while left:
+        runs.append(next(iter(left)))
+        run = left.pop(runs[-1])
+        while related := [path for path, its in left.items() if its & run]:
+            run = run.union(*(left.pop(path) for path in related))
     if len(runs) > 1:
-        names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
-        some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
+        some = "; ".join(map(str, runs[:8])) + ("; …" if len(runs) > 8 else "")
         raise ReviewError(
             f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
             "`aeroloop log compare`"
@@ -321,13 +296,9 @@ def _check_that_all_are_of_one_run(marks: Mapping[Path, set[object]]) -> None:
 
 def _read_description(text: str | bytes, address: Address | None) -> Description:
     """Parse a description, recorded under a key. Raises ValueError if it is malformed, or not what its key says."""
-    try:
-        content = json.loads(text)
-    except RecursionError:
-        raise ValueError("it is nested too deeply") from None
-    if not isinstance(content, dict):
-        raise ValueError("a description is no JSON object")
-    if (version := content.get("protocol", PROTOCOL_VERSION)) != PROTOCOL_VERSION:
+    content = from_json(text)
+    version = content.get("protocol", PROTOCOL_VERSION) if isinstance(content, dict) else PROTOCOL_VERSION
+    if version != PROTOCOL_VERSION:
         raise ValueError(f"it is of protocol version {version}; read it with the aeroloop that wrote it")
     description = Description.model_validate(content, extra="ignore")
     if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
@@ -337,16 +308,6 @@ def _read_description(text: str | bytes, address: Address | None) -> Description
     except ConfigError as error:
         raise ValueError(str(error)) from None
     return description
-
-
-def _begin_ns(path: Path) -> int:
-    """When a file's first message was recorded [ns since 1970]; 0 without any. Raises ReviewError."""
-    try:
-        return next((one.log_time for one in records(path) if isinstance(one, Message)), 0)
-    except NotMcapError as error:
-        raise ReviewError(f"{error}, so it is no log") from None
-    except OSError as error:
-        raise ReviewError(f"cannot read {path}: {error.strerror}") from None
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:

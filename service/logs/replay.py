@@ -20,13 +20,11 @@ from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed, why_
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
-from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import from_description, load_over
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
-from aeroloop.service.logs.ticks import LoggedController, commanded, in_rows
+from aeroloop.service.logs.ticks import LoggedController, commanded
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -75,9 +73,6 @@ class Replay(BaseModel, frozen=True):
         description="by end that was asked for: what was not compared, since the log lacks it, is cut or damaged, or "
         "cannot be computed again from it"
     )
-    details: dict[End, list[str]] = Field(
-        default={}, exclude=True, description="by end: what its first difference is in units and steps, in words"
-    )
 
     @property
     def differs(self) -> bool:
@@ -98,12 +93,8 @@ def replay(
 ) -> Replay:
     """Replay every session of a run.
 
-    Args:
-        paths: Logs, folders of logs, or a rotated run.
-        overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
-            or of the reference replaces every logged change of them. The plant is not replayed then.
-        progress: Called repeatedly with the share done, 0…1.
-        ends: Ends to replay; the plant takes most of the time.
+    With overrides, `section.key=value`, the controller is computed with another law instead, and the plant is not. An
+    override of the gains or of the reference replaces every logged change of them.
 
     Raises:
         ReviewError: It cannot be read, or has no configuration of any end.
@@ -112,21 +103,17 @@ def replay(
     recording = Recording(paths, progress)
     recording.choose()  # raises where there is no session
     reasons: dict[str, str] = {end: "only the other end was replayed" for end in ENDS if end not in ends}
-    details, unseen = dict[End, list[str]](), dict[End, list[str]]()
+    unseen = dict[End, list[str]]()
     sessions, plants = list[SessionReplay](), list[PlantReplayed]()
     failed: dict[SessionKey, AeroloopError] = {}
     if "controller" in ends:
         for which in (which for which, extent in recording.extents.items() if extent.rows["controller"]):
             try:
-                one, differences = _replay_session(recording, which, overrides, progress)
+                sessions.append(_replay_session(recording, which, overrides, progress))
             except AeroloopError as error:
                 if overrides:
                     raise
                 failed[which] = error
-            else:
-                sessions.append(one)
-                if differences:
-                    details.setdefault("controller", differences)
         unseen["controller"] = [str(one) for one in recording.unknown]
         if failed:
             reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
@@ -137,7 +124,7 @@ def replay(
     if overrides:
         reasons["plant"] = "the plant of a log does not follow another configuration"
     elif "plant" in ends:
-        plants, reason, unseen["plant"], details["plant"] = _replay_plants(recording, progress)
+        plants, reason, unseen["plant"] = _replay_plants(recording, progress)
         if reason is not None:
             reasons["plant"] = reason
     if failed and not (sessions or plants):
@@ -156,7 +143,6 @@ def replay(
         missing=missing,
         damages=recording.unread,
         unseen=unseen,
-        details=details,
     )
 
 
@@ -168,53 +154,43 @@ def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay 
 
 def _replay_session(
     recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None
-) -> tuple[SessionReplay, list[str]]:
-    """Replay a session; the first difference also in words. Raises AeroloopError if that cannot be."""
+) -> SessionReplay:
+    """Replay a session's controller. Raises AeroloopError if that cannot be."""
     settings = load_over(recording.settings(which), overrides)
     parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
     ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
     session = recording.session(which)
     logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
     rows, wire, period = session.controller, settings.wire, settings.loop.period
-    blank = bytes(wire.command.size)
     sent_as, frames = bytearray(), bytearray()
 
     def share(done: float) -> None:
         if progress is not None:
             progress(INDEXING + (1 - INDEXING) / 2 * done)
 
-    for i, (tick, received_as, measurement) in enumerate(
-        in_rows([rows[name] for name in ("tick", "received_as", "measurement")], share)
-    ):
-        logged.resume(i)
-        answer = logged.answer(tick, received_as, measurement)
+    for answer in logged.answers(share):
         sent_as.append(Sent.NONE if answer is None else Sent.FRAME if answer else Sent.SILENT)
-        frames += answer or blank
+        frames += answer or bytes(wire.command.size)
 
     computed_as, computed = np.frombuffer(sent_as, np.uint8), np.frombuffer(frames, f"V{wire.command.size}")
-    of_one_size = wire.command.size == session.settings.wire.command.size
-    differ = (computed_as != rows["sent_as"]) | (
-        computed != rows["command"] if of_one_size else computed_as == Sent.FRAME
-    )
+    if wire.command.size == session.settings.wire.command.size:
+        differ = (computed_as != rows["sent_as"]) | (computed != rows["command"])
+    else:
+        differ = (computed_as != rows["sent_as"]) | (computed_as == Sent.FRAME)
     answered = computed_as != Sent.NONE
     before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
     after, _ = commanded(session, wire, computed_as, computed)
     before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
-    square, ticks = added(0.0, squares(after - before)), int(answered.sum())
-    difference, details = None, list[str]()
+    difference, ticks = None, int(answered.sum())
     if differ.any():
         first = int(np.argmax(differ))
-        tick, was_as, now_as = int(rows["tick"][first]), Sent(int(rows["sent_as"][first])), Sent(sent_as[first])
-        was, now = bytes(rows["command"][first]), bytes(computed[first])
+        tick = int(rows["tick"][first])
         difference = TickDifference(
             tick=tick,
             time_s=round(tick * period, 9),
-            logged=was.hex() if was_as == Sent.FRAME else was_as.name.lower(),
-            computed=now.hex() if now_as == Sent.FRAME else now_as.name.lower(),
+            logged=_in_hex(rows["sent_as"][first], rows["command"][first]),
+            computed=_in_hex(computed_as[first], computed[first]),
         )
-        if was_as == now_as == Sent.FRAME:
-            signals = [(f"u{motor}", " V", wire.voltage) for motor in wire.motors]
-            details = _in_units(wire.command, signals, was, now)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],
@@ -222,23 +198,25 @@ def _replay_session(
         ticks=ticks,
         differ=int(differ.sum()),
         first_difference=difference,
-        rms_v=sqrt(square / ticks) if ticks else None,
+        rms_v=sqrt(added(0.0, squares(after - before)) / ticks) if ticks else None,
         max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
         u_total_logged=added(0.0, squares(before)) * period,
         u_total_computed=added(0.0, squares(after)) * period,
-    ), details
+    )
+
+
+def _in_hex(sent_as: np.uint8, frame: np.void) -> str:
+    return frame.tobytes().hex() if sent_as == Sent.FRAME else Sent(int(sent_as)).name.lower()
 
 
 def _replay_plants(
     recording: Recording, progress: Progress | None
-) -> tuple[list[PlantReplayed], str | None, list[str], list[str]]:
+) -> tuple[list[PlantReplayed], str | None, list[str]]:
     """Replay the plants of a run, each process from its first row with the configuration that it started with.
 
-    Returns the result of each process, the reason if there is none or one ends early, which rows are not compared, and
-    the first difference in words.
+    Returns the result of each process, the reason if there is none or one ends early, and which rows are not compared.
     """
-    results, reasons = list[PlantReplayed](), list[str]()
-    unseen, details = list[str](), list[str]()
+    results, reasons, unseen = list[PlantReplayed](), list[str](), list[str]()
     plants = list(recording.plants())
     done, total = 0, max(1, sum(batch.header.rows for *_, batches in plants for batch in batches))
     for source, description, batches in plants:
@@ -261,32 +239,10 @@ def _replay_plants(
                     if progress is not None:
                         progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * done / total)
                 results.append(result := one.result())
-                left, reason, first = left - result.ticks, result.stopped, result.first_difference
-                if first is not None and first.field == "measurement" and not details:
-                    signals = [(f"ε{i}", "", its.wire.attitude) for i in (1, 2, 3)]
-                    signals += [(f"ω{i}", " rad/s", its.wire.rate) for i in (1, 2, 3)]
-                    frames = map(bytes.fromhex, (first.logged, first.computed))
-                    details = _in_units(its.wire.measurement, signals, *frames)
+                left, reason = left - result.ticks, result.stopped
         if reason is not None:
             reasons.append(reason)
         if left > 0:
             unseen.append(f"{left} of the plant's rows: {reason or 'a batch of them cannot be read'}")
     none = None if results else "the log has no trace of a plant"
-    return results, next(iter(reasons), none), unseen, details
-
-
-def _in_units(
-    kind: FrameFormat, signals: Sequence[tuple[str, str, SignalSpec]], logged: bytes, computed: bytes
-) -> list[str]:
-    """What differs between two frames, a line per signal: both values in units, and how many quantizer steps apart."""
-    was, now = kind.unpack(logged), kind.unpack(computed)
-    if was is None or now is None:
-        return [f"the {'logged' if was is None else 'computed'} frame is malformed"]
-    lines = [f"counter: {was[0]} logged, {now[0]} computed"] if was[0] != now[0] else []
-    for (name, unit, signal), a, b in zip(signals, was[1], now[1], strict=True):
-        if a != b and (a == a or b == b):
-            quantizer = signal.quantizer()
-            steps = f", {abs(b - a):g} steps apart" if signal.bits else ""
-            was_v, now_v = (f"{x:g}{unit}" if x == x else "no valid value" for x in map(quantizer.level, (a, b)))
-            lines.append(f"{name}: {was_v} logged, {now_v} computed{steps}")
-    return lines
+    return results, next(iter(reasons), none), unseen

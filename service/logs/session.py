@@ -1,10 +1,20 @@
-"""A session of a log: a table of rows for each end, joined on the tick; and the plant's true states."""
+"""Sessions of a log: which batches there are, what the log lacks, what was in force when, and both ends' joined tables.
+
+Rows are numbered per process of an end, so a jump in the numbers is the number of missing rows.
+
+The tail of a controller's batch has the changes among its rows and, once a second, the record of what is in force with
+the tick since when; the plant's batches repeat the last record that the controller sent. So a record proves what was in
+force from that tick to its own, and from a proven tick on the rows of the controller prove it up to a gap, after which
+they count from the first batch that begins with gains and reference known. No reader computes anything of other ticks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, nan
+from itertools import pairwise
+from math import inf
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +24,7 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.messages.models import MAX_SIGNALS, Description, Truth
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import (
+    ENDS,
     NEVER,
     Batch,
     End,
@@ -33,8 +44,7 @@ Integers = npt.NDArray[np.int64]
 Places = npt.NDArray[np.int32]
 Table = npt.NDArray[np.void]
 
-SessionKey = tuple[str, str]
-"""A vehicle and a session."""
+SessionKey = tuple[str, str]  # a vehicle and a session
 
 NO_TICK: Final = -1
 
@@ -86,51 +96,27 @@ class Extent(NamedTuple):
         return self.last["controller"] - self.first["controller"] + 1 if self.rows["controller"] else 0
 
 
-@dataclass(frozen=True)
-class Session:
-    """Both ends' rows of a session in order, and their join on the tick. Rows of unknown ticks are left out.
+# ── index of the batches ──
 
-    Times are on the end's monotonic clock, −1 for none [ns]; with `wall` added they are on its wall clock.
+_MOST: Final = 1 << 62  # more rows than any process publishes, and more nanoseconds than any clock counts
 
-    Attributes:
-        which: The session.
-        settings: The configuration, each section from the role that owns it.
-        descriptions: Of the roles as the session began.
-        extent: What was recorded of it.
-        controller: Columns tick, received_as, sent_as, received, sent, wall, measurement, command.
-        plant: Columns tick, session_tick, sent_as, received_as, outcome, trip, answered (−1 for none), sent, received,
-            wall, measurement, command.
-        changes: Changes of gains and reference, in the order of their ticks.
-        states: The controller's state before its first row and each first row after a gap, by the row's index.
-        missing: Rows that the log lacks.
-        unknown: Ticks that are left out, as the log does not hold what was in force then.
-        k: Ticks with a row of either end. Shape (n,).
-        at_controller: Index of the controller's row that computed each tick, or −1. Shape (n,).
-        at_plant: Index of the plant's row of each tick, or −1. Shape (n,).
-        acted: Index of the plant's row that first acted on the command that answers each tick, or −1. Shape (n,).
-    """
+Ranges = Sequence[tuple[int, int]]  # first and last tick of each
 
-    which: SessionKey
-    settings: Settings
-    descriptions: dict[str, Description]
-    extent: Extent
-    controller: Table
-    plant: Table
-    changes: list[Change]
-    states: dict[int, dict[str, Any]]
-    missing: list[Missing]
-    unknown: list[Unknown]
-    k: Integers
-    at_controller: Places
-    at_plant: Places
-    acted: Places
+
+class Source(NamedTuple):
+    """A process of an end."""
+
+    vehicle: str
+    end: End
+    run: int
 
 
 class Entry(NamedTuple):
     """A batch of a trace, as it was recorded."""
 
     header: Header
-    place: slice  # where its bytes are in `TraceIndex.payloads`
+    place: slice  # of its bytes in `TraceIndex.payloads`
+    published_ns: int
     first: int  # tick of the first row
     last: int  # highest tick; a late row is of an earlier one
     proof: int  # a tick of the other end whose row there must be
@@ -143,32 +129,232 @@ class Entry(NamedTuple):
         return self.header.first_row + self.header.rows
 
 
+class TraceIndex:
+    """Which batches a run's traces have; after `finish`, also what they lack."""
+
+    def __init__(self) -> None:
+        self.extents: dict[SessionKey, Extent] = {}  # in the order of publication
+        self.missing: list[Missing] = []
+        self.changes: dict[SessionKey, list[Change]] = {}  # of gains and reference, in order
+        self.unknown: list[Unknown] = []  # ticks whose gains, reference or law's state the log does not hold
+        self.entries: defaultdict[Source, list[Entry]] = defaultdict(list)  # of a process, in the order of its rows
+        self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)  # likewise
+        self.payloads = bytearray()  # one object: many small ones would not return 140 MB an hour to the system
+        self.malformed = 0  # batches that are malformed, or of no process of the session
+        self._known: set[int] = set()
+
+    def add(self, vehicle: str, payload: bytes, published_ns: int) -> set[object]:
+        """Add a batch, once; returns its process and session. A malformed one is dropped and counted."""
+        batch = read_batch(payload)
+        if batch is None or max(batch.header.first_row, batch.header.monotonic_ns) >= _MOST:
+            self.malformed += 1
+            return set()
+        header, tail = batch.header, batch.tail
+        source, session = Source(vehicle, header.end, header.run), header.session
+        if (identity := hash((source, payload))) not in self._known:
+            self._known.add(identity)
+            changes = [change for change in tail.changes if change.session == session]
+            record = tail.record if all(change.session == session for change in tail.record) else []
+            place = slice(len(self.payloads), len(self.payloads) + len(payload))
+            self.payloads += payload
+            self.entries[source].append(Entry(header, place, published_ns, *_ticks(batch), changes, record))
+        return {source, (vehicle, session)} if session else {source}
+
+    def finish(self) -> None:
+        """Find sessions, and what the log lacks of them, once all batches are added."""
+        self._sort_out()
+        for source, entries in self.entries.items():
+            for entry in entries:
+                if entry.header.session:
+                    self.parts[(source.vehicle, entry.header.session), source.end].append(entry)
+            self._find_gaps(source, [entry for entry in entries if entry.header.rows or entry.header.final])
+        begun = sorted(self.parts.items(), key=lambda its: min(entry.published_ns for entry in its[1]))
+        for (which, end), part in begun:
+            if having := [entry for entry in part if entry.header.rows]:
+                extent = self.extents.setdefault(which, Extent(*(dict.fromkeys(ENDS, n) for n in (0, NO_TICK, 0))))
+                extent.first[end] = min(entry.first for entry in having)
+                extent.last[end] = max(entry.last for entry in having)
+                extent.rows[end] = sum(entry.header.rows for entry in having)
+        for which, extent in self.extents.items():
+            proofs = {end: max((one.proof for one in self.parts[which, end]), default=NO_TICK) for end in ENDS}
+            for end, other in zip(ENDS, reversed(ENDS), strict=True):
+                if any((m.vehicle, m.session, m.end, m.last_tick) == (*which, end, None) for m in self.missing):
+                    continue
+                proof, last = proofs[other], extent.last[end]
+                if proof > last:  # the other end proves rows after the last one
+                    self._lacks(*which, end, last + 1, proof, proof - last)
+                elif not any(entry.header.final for entry in self.parts[which, end]):
+                    self._lacks(*which, end, last + 1, None, 0)
+            self._find_unknown(which, max(extent.last["controller"], proofs["plant"]))
+
+    def _sort_out(self) -> None:
+        """Put batches in order, without those that overlap others and those of a session that is another process's.
+
+        A process claims a session or grants it, so the one with most of its rows at an end owns it.
+        """
+        rows: defaultdict[tuple[str, End, str], Counter[Source]] = defaultdict(Counter)
+        for source, entries in self.entries.items():
+            after, kept = 0, list[Entry]()
+            # one without rows precedes the batch that starts at the same row
+            for entry in sorted(entries, key=lambda e: (e.header.first_row, e.header.rows > 0, e.header.monotonic_ns)):
+                if not entry.header.rows or entry.header.first_row >= after:
+                    kept.append(entry)
+                    after = max(after, entry.after)
+                    rows[source.vehicle, source.end, entry.header.session][source] += entry.header.rows
+            self.malformed += len(entries) - len(kept)
+            self.entries[source] = kept
+        owners = {which: counts.most_common(1)[0][0] for which, counts in rows.items()}
+        for source, entries in self.entries.items():
+            its = {""} | {session for (*_, session), owner in owners.items() if owner == source}
+            self.entries[source] = [entry for entry in entries if entry.header.session in its]
+            self.malformed += len(entries) - len(self.entries[source])
+
+    def _find_gaps(self, source: Source, having: Sequence[Entry]) -> None:
+        """Find missing rows between the batches of a process that have rows or end a session."""
+        vehicle, end, _ = source
+        if having and (rows := min(having[0].header.first_row, having[0].first)) > 0:
+            self._lacks(vehicle, having[0].header.session, end, 0, having[0].first - 1, rows)
+        for one, following in pairwise(having):
+            rows = following.header.first_row - one.after
+            before, session = one.header.session, following.header.session
+            if rows and before == session:
+                last = following.first - 1 if following.header.rows else None
+                self._lacks(vehicle, session, end, one.last + 1, last, rows)
+            elif rows:
+                head = min(rows, max(0, following.first))  # it has no more rows before than ticks
+                tail = 0 if one.header.final else rows - head  # of the session before, or of others after it
+                if tail:
+                    self._lacks(vehicle, before, end, one.last + 1, None, tail)
+                elif rows > head:
+                    self._lacks(vehicle, "", end, 0, None, rows - head)
+                if head:
+                    self._lacks(vehicle, session, end, 0, following.first - 1, head)
+
+    def _lacks(self, vehicle: str, session: str, end: End, first: int, last: int | None, rows: int) -> None:
+        lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
+        self.missing.append(lacks)
+
+    def _find_unknown(self, which: SessionKey, last_tick: int) -> None:
+        """Find a session's changes, and the ticks up to the last answered one at which they are not known."""
+        entries = [entry for end in ENDS for entry in self.parts[which, end]]
+        self.changes[which] = _changes(entries)
+        records = [(max(change.tick for change in one.record), one.last) for one in entries if _is_whole(one.record)]
+        proven = [(first, max(first, last)) for first, last in records]
+        having = [entry for entry in self.parts[which, "controller"] if entry.header.rows]
+        begun = [change for entry in entries for change in entry.changes if change.tick == 0]
+        # A session whose first row is of a later tick has found no attitude to hold before.
+        if having and having[0].first == 0 and _is_whole(begun):
+            proven.append((0, 0))
+        gaps = [i for i in range(1, len(having)) if having[i].header.first_row > having[i - 1].after]
+        recorded, known = list[tuple[int, int]](), list[tuple[int, int]]()
+        for i, j in pairwise([0, *gaps, len(having)]) if having else ():  # rows without a gap
+            rows = having[i:j]
+            first, last = rows[0].first, max(entry.last for entry in rows)
+            recorded.append((first, last))
+            since = min((max(a, first) for a, b in proven if a <= last and b >= first), default=last + 1)
+            since = next((entry.first for entry in rows if entry.first >= since), last + 1)
+            known.append((since, last))
+        extent = self.extents[which]
+        begin = min(extent.first[end] for end in ENDS if extent.rows[end])
+        if begin > last_tick:
+            return
+        turns = [turn for first, last in (*proven, *recorded, *known) for turn in (first, last + 1)]
+        edges = np.unique(np.clip([begin, *turns, last_tick + 1], begin, last_tick + 1))
+        unknown = ~_within(edges, known) & (_within(edges, recorded) | ~_within(edges, proven))
+        unknown[-1] = False
+        begins, ends = edges[np.flatnonzero(np.diff(unknown, prepend=False))].reshape(-1, 2).T.tolist()
+        for first, last in zip(begins, ends, strict=True):
+            self.unknown.append(Unknown(vehicle=which[0], session=which[1], first_tick=first, last_tick=last - 1))
+
+
+def _ticks(batch: Batch) -> tuple[int, int, int]:
+    """First and last tick of a batch, and a tick that it proves of the other end."""
+    columns, end = batch.columns, batch.header.end
+    if not batch.header.rows:
+        return NO_TICK, NO_TICK, NO_TICK
+    ticks = columns["tick" if end == "controller" else "session_tick"]
+    first, last = int(ticks[0]), int(ticks.max())
+    if end == "controller":
+        return first, last, last if columns["received_as"][-1] == Received.FRAME else NO_TICK
+    answered = int(columns["answered"][-1])
+    return first, last, NO_TICK if answered == NEVER else answered
+
+
+def _changes(entries: Sequence[Entry]) -> list[Change]:
+    """All changes in order: those of the batches, and of records those that no batch has."""
+    found = [change for entry in entries for change in entry.changes]
+    had = {(change.tick, part) for change in found for part in _parts(change)}
+    for change in (change for entry in entries for change in entry.record):
+        if not had.issuperset(its := {(change.tick, part) for part in _parts(change)}):
+            had |= its
+            found.append(change)
+    return sorted(found, key=lambda change: change.tick)
+
+
+def _parts(change: Change) -> list[str]:
+    return [name for name in ("gains", "reference") if getattr(change, name) is not None]
+
+
+def _is_whole(changes: Iterable[Change]) -> bool:
+    return {part for change in changes for part in _parts(change)} == {"gains", "reference"}
+
+
+def _within(ticks: Integers, ranges: Ranges) -> npt.NDArray[np.bool_]:
+    """Whether any range has each tick."""
+    firsts, lasts = np.array(ranges, np.int64).reshape(-1, 2).T
+    return np.searchsorted(np.sort(firsts), ticks, "right") > np.searchsorted(np.sort(lasts), ticks, "left")
+
+
+# ── tables ──
+
+
+@dataclass(frozen=True)
+class Session:
+    """Both ends' rows of a session in order, and their join on the tick. Rows of unknown ticks are left out.
+
+    Times are on the end's monotonic clock, −1 for none [ns]; with `wall` added they are on its wall clock.
+    """
+
+    which: SessionKey
+    settings: Settings  # each section from the role that owns it
+    descriptions: dict[str, Description]  # of the roles as the session began
+    extent: Extent
+    controller: Table  # tick, received_as, sent_as, received, sent, measurement, command, wall
+    plant: Table  # tick, session_tick, sent_as, received_as, outcome, trip, answered (−1: none), sent, received, …
+    changes: list[Change]  # of gains and reference, in the order of their ticks
+    states: dict[int, dict[str, Any]]  # the controller's before its first row and each after a gap, by the row's index
+    missing: list[Missing]  # rows that the log lacks
+    unknown: list[Unknown]
+    k: Integers  # ticks with a row of either end. Shape (n,)
+    at_controller: Places  # index of the controller's row that computed each tick, or −1. Shape (n,)
+    at_plant: Places  # index of the plant's row of each tick, or −1. Shape (n,)
+    acted: Places  # index of the plant's row that first acted on the command that answers it, or −1. Shape (n,)
+
+
 def table_of(
-    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: memoryview
+    end: End, wire: WireSpec, entries: Sequence[Entry], payloads: bytearray
 ) -> tuple[Table, dict[int, dict[str, Any]], int]:
     """One end's rows, from batches in order.
 
     Returns:
         The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
-    sizes = wire.actuators, wire.measurement.size, wire.command.size
-    fitting = [one for one in entries if one.header.row_dtype == row_dtype(one.header.end, *sizes)]
-    kinds = row_dtype(end, *sizes)
-    wide = {"tick", "session_tick", "answered", "received", "sent"}
-    columns = [
-        (name, np.dtype(np.int64) if name in wide else kinds[name]) for name in kinds.names or () if name != "voltages"
-    ]
-    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype([*columns, ("wall", np.dtype(np.int64))]))
+    kinds = row_dtype(end, wire.actuators, wire.measurement.size, wire.command.size)
+    fitting = [one for one in entries if one.header.row_dtype == kinds]
+    columns = [name for name in kinds.names or () if name != "voltages"]
+    wide = {"tick", "session_tick", "answered", "received", "sent", "wall"}
+    form = [(name, np.dtype(np.int64) if name in wide else kinds[name]) for name in (*columns, "wall")]
+    table = np.zeros(sum(one.header.rows for one in fitting), np.dtype(form))
     states = dict[int, dict[str, Any]]()
     filled, next_row = 0, -1
-    for entry in fitting:
-        header, payload = entry.header, bytes(payloads[entry.place])
+    for header, place, *_ in fitting:
+        payload = bytes(payloads[place])
         batch = Batch(header, read_columns(header, payload), Tail())
         if header.first_row != next_row and (whole := read_batch(payload)) is not None and whole.tail.state is not None:
             states[filled] = whole.tail.state
-        next_row = entry.after
+        next_row = header.first_row + header.rows
         rows = table[filled : filled + header.rows]
-        for name, _ in columns:
+        for name in columns:
             rows[name] = batch.columns[name]
         rows["received"], rows["sent"] = batch.times_ns("received"), batch.times_ns("sent")
         rows["wall"] = header.wall_ns - header.monotonic_ns
@@ -208,8 +394,9 @@ class TrueStates:
 
     def __init__(self, actuators: Mapping[str, int]) -> None:
         self._actuators = actuators
-        self._states: dict[str, dict[int, tuple[float, ...]]] = {session: {} for session in actuators}
-        self._signals: dict[str, dict[str, dict[int, float]]] = {session: {} for session in actuators}
+        self._states: dict[str, dict[int, tuple[tuple[float, ...], dict[str, float | None]]]]
+        self._states = {session: {} for session in actuators}
+        self._names: dict[str, set[str]] = {session: set() for session in actuators}
 
     def add(self, data: bytes) -> None:
         """Add a message, unless it is of another session; of a tick, the first counts.
@@ -218,26 +405,23 @@ class TrueStates:
             ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
         """
         truth = Truth.model_validate_json(data)
-        if truth.session is None or truth.session not in self._actuators or (k := truth.session_tick) is None:
+        if (session := truth.session) is None or session not in self._actuators or (k := truth.session_tick) is None:
             return
-        signals = self._signals[truth.session]
-        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[truth.session]:
+        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[session]:
             raise ValueError("a true state of no tick of its session")
-        if len({*signals, *truth.signals}) > MAX_SIGNALS:
+        if len(self._names[session] | truth.signals.keys()) > MAX_SIGNALS:
             raise ValueError("more signals than a plant has")
-        self._states[truth.session].setdefault(k, (k, *truth.attitude, *truth.rate, *truth.voltages))
-        for name, value in truth.signals.items():
-            signals.setdefault(name, {}).setdefault(k, nan if value is None else value)
+        if k not in self._states[session]:
+            self._states[session][k] = (k, *truth.attitude, *truth.rate, *truth.voltages), truth.signals
+            self._names[session].update(truth.signals)
 
     def rows(self, session: str) -> Array:
         """Tick, q, ω and the motors' voltages, ascending. Shape (n, 8 + actuators)."""
-        rows = [row for _, row in sorted(self._states[session].items())]
+        rows = [row for _, (row, _) in sorted(self._states[session].items())]
         return np.array(rows, np.float64).reshape(-1, 8 + self._actuators[session])
 
     def signals(self, session: str) -> dict[str, Array]:
         """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
-        ticks = sorted(self._states[session])
-        return {
-            name: np.array([values.get(k, nan) for k in ticks])
-            for name, values in sorted(self._signals[session].items())
-        }
+        found = [signals for _, (_, signals) in sorted(self._states[session].items())]
+        names = sorted(self._names[session])
+        return {name: np.array([signals.get(name) for signals in found], np.float64) for name in names}

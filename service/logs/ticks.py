@@ -8,7 +8,7 @@ again, bit for bit; after missing rows, the log has the controller's state.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
@@ -31,53 +31,34 @@ from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 
 Flags = npt.NDArray[np.bool_]
-Codes = npt.NDArray[np.int16] | Array
-"""Codes of frames: integers, or the doubles of a wire that is not quantized."""
+Codes = npt.NDArray[np.int16] | Array  # integers, or the doubles of a wire that is not quantized
 
-AT_A_TIME: Final = 8192
-"""Rows that are turned into Python's objects at a time."""
-
-WINDOW: Final = 512
-"""Ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second."""
+AT_A_TIME: Final = 8192  # rows that are turned into Python's objects at a time
+WINDOW: Final = 512  # ticks per fit of the clocks' offset; two crystals drift apart by less than 1 µs per second
 _LEAST: Final = 16
 
 
 class Ticks(NamedTuple):
-    """Ticks in order, a row each. What is unknown is NaN, a time −1. Shapes (n,) and (n, columns).
+    """Ticks in order, a row each. What is unknown is NaN, a time −1. Shapes (n,) and (n, columns)."""
 
-    Attributes:
-        k: Tick of the law; its time is k·period.
-        wall_ns: When its measurement was sent, on the plant's wall clock; on the controller's where the plant's rows
-            are missing [ns since 1970].
-        sent_ns: When it was sent, on the plant's monotonic clock; −1 where it was not [ns].
-        latency_ns: From then until the command that answers it was received, on the same clock. In lockstep, where the
-            plant waits for each command, NaN as both delays.
-        measurement_delay_ns: From the plant's sending to the controller's receiving (see `clock_offset`).
-        command_delay_ns: From the controller's sending to the plant's receiving.
-        attitude: q as measured. The other quantities of the law likewise, in its units.
-        voltages: What was commanded; NaN where nothing was, or no valid value [V].
-        unquantized: u before quantization [V].
-        gains: The law's gains, one beside the other.
-        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad] and the sign of the equilibrium.
-        state_next: The same after the tick. Where the controller computed nothing, that of the last tick that it did.
-    """
-
-    k: Integers
-    wall_ns: Integers
-    sent_ns: Integers
-    latency_ns: Array
-    measurement_delay_ns: Array
-    command_delay_ns: Array
-    attitude: Array
-    desired: Array
-    rate: Array
-    attitude_error: Array
-    rate_error: Array
-    voltages: Array
-    unquantized: Array
-    gains: Array
-    state: Array
-    state_next: Array
+    k: Integers  # tick of the law; its time is k·period
+    wall_ns: (
+        Integers  # when it was measured, on the plant's wall clock; on the controller's where the plant's row lacks
+    )
+    sent_ns: Integers  # when the measurement was sent, on the plant's monotonic clock; −1 where it was not
+    latency_ns: Array  # from then until its answer was received; as both delays NaN in lockstep, where the plant waits
+    measurement_delay_ns: Array  # from the plant's sending to the controller's receiving; see `clock_offset`
+    command_delay_ns: Array  # from the controller's sending to the plant's receiving
+    attitude: Array  # q as measured
+    desired: Array  # q_d
+    rate: Array  # ω as measured, body frame [rad/s]
+    attitude_error: Array  # ε̃
+    rate_error: Array  # ω_e, body frame [rad/s]
+    voltages: Array  # what was commanded; NaN where nothing was, or no valid value [V]
+    unquantized: Array  # u before quantization [V]
+    gains: Array  # the law's gains, one beside the other
+    state: Array  # the law's named state that it used; of the paper's θ̂ [N·m·s/rad] and the sign of the equilibrium
+    state_next: Array  # the same after the tick; of the last tick before where the controller computed nothing
 
     @property
     def desired_rate(self) -> Array:
@@ -90,38 +71,23 @@ class Ticks(NamedTuple):
 
 
 class Recomputed(NamedTuple):
-    """A session, computed again.
+    """A session, computed again."""
 
-    Attributes:
-        ticks: Ticks with a valid measurement, up to the last that was answered. A tick that the controller did not
-            compute has the errors of the plant's own measurement.
-        answered: Ticks that a command answered, be it one without a valid value. Shape (m,).
-        voltages: What was commanded at them [V]. Shape (m, actuators).
-        missed: Ticks up to the last answered one that the plant measured and the controller did not compute.
-        unsent: How many of the judged measurements, and of the answers, were silent.
-        measurements: Codes of all measurement frames. Shape (n, 6).
-        commands: Codes of all command frames. Shape (n, actuators).
-        offset_ns: Between both ends' clocks, at the first and the last tick where it is known; NaN if it is not.
-    """
-
-    ticks: Ticks
-    answered: Integers
-    voltages: Array
-    missed: Integers
-    unsent: tuple[int, int]
-    measurements: Codes
-    commands: Codes
-    offset_ns: tuple[float, float]
+    ticks: Ticks  # with a valid measurement, up to the last answered; errors are the plant's own where only it ran
+    answered: Integers  # ticks that a command answered, be it one without a valid value. Shape (m,)
+    voltages: Array  # what was commanded at them [V]. Shape (m, actuators)
+    missed: Integers  # ticks up to the last answered one that the plant measured and the controller did not compute
+    unsent: tuple[int, int]  # how many of the judged measurements, and of the answers, were silent
+    measurements: Codes  # codes of all measurement frames. Shape (n, 6)
+    commands: Codes  # codes of all command frames. Shape (n, actuators)
+    offset_ns: tuple[float, float]  # between the ends' clocks, at the first and the last tick where it is known, or NaN
 
 
 class LoggedController:
     """The controller of a session, which answers its rows again, one after the other.
 
-    Args:
-        session: The session.
-        settings: What to compute with; the session's configuration if None.
-        ignored: Which parts of the logged changes to leave out.
-        resumes: Continue from the recorded state where rows are missing within the session.
+    With other `settings` than the session's, parts of the logged changes may be `ignored`. It `resumes` from the
+    recorded state where rows are missing. `state_before` is the law's state before the last row.
     """
 
     def __init__(
@@ -134,9 +100,30 @@ class LoggedController:
     ) -> None:
         settings = settings or session.settings
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self.state_before = np.array(self.controller.last_valid["state_next"])
+        self._rows = session.controller
         self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
         self._changes: deque[Change] = deque(session.changes)
         self._ignored: dict[str, None] = dict.fromkeys(ignored)
+
+    def answers(self, progress: Progress | None = None) -> Iterator[bytes | None]:
+        """The command that answers each row: a frame, UNCHANGED, or None. Raises ReviewError as `resume`."""
+        rows, state = self._rows, self.controller.last_valid["state_next"]
+        for begin in range(0, len(rows), AT_A_TIME):
+            some = rows[begin : begin + AT_A_TIME]
+            columns = (some[name].tolist() for name in ("tick", "received_as", "measurement"))
+            for i, (tick, received_as, frame) in enumerate(zip(*columns, strict=True), begin):
+                self.resume(i)
+                self.state_before[:] = state
+                if received_as == Received.LATE:
+                    self.controller.hold(frame)
+                if received_as in (Received.FRAME, Received.SILENT):
+                    self.change(tick)
+                    yield self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
+                else:
+                    yield None
+            if progress is not None:
+                progress(min(1.0, (begin + AT_A_TIME) / len(rows)))
 
     def change(self, k: int) -> None:
         """Apply the logged changes of gains and reference up to tick k."""
@@ -151,24 +138,6 @@ class LoggedController:
             except ValidationError as error:
                 why = str(error).splitlines()[0]
                 raise ReviewError(f"the log has a state that is not of this version: {why}") from None
-
-    def answer(self, tick: int, received_as: int, frame: bytes) -> bytes | None:
-        """The command that answers a row: a frame, UNCHANGED, or None if there is nothing to answer."""
-        if received_as == Received.LATE:
-            self.controller.hold(frame)
-        if received_as not in (Received.FRAME, Received.SILENT):
-            return None
-        self.change(tick)
-        return self.controller.tick(frame if received_as == Received.FRAME else UNCHANGED, tick)
-
-
-def in_rows(columns: Sequence[npt.NDArray[Any]], progress: Progress | None = None) -> Iterator[tuple[Any, ...]]:
-    """The rows of some columns, as Python's numbers and bytes."""
-    size = len(columns[0])
-    for begin in range(0, size, AT_A_TIME):
-        yield from zip(*(column[begin : begin + AT_A_TIME].tolist() for column in columns), strict=True)
-        if progress is not None:
-            progress(min(1.0, (begin + AT_A_TIME) / size))
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -217,34 +186,28 @@ def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
 
 
 def _computed(session: Session, progress: Progress | None) -> tuple[Array, list[int], Integers]:
-    """What was computed at each tick, and the places of ticks that the plant measured and the controller did not.
+    """Rows of the law's state, q, the state after, q_d, ω, ε̃, ω_e and u at each tick, of these widths.
 
-    A row has the law's state that it used, q, the state after, q_d, ω, ε̃, ω_e and u, of these widths. Shape (n, sum).
+    And the places of the ticks that the plant measured and the controller did not compute.
     """
     logged = LoggedController(session)
-    outputs = logged.controller.outputs
+    outputs, before = logged.controller.outputs, len(logged.state_before)
     names = list(outputs)[: list(outputs).index("u") + 1]
-    state, row = np.asarray(logged.controller.last_valid["state_next"]), np.asarray(logged.controller.row)
-    widths = [len(state), *(len(outputs[name]) for name in names)]
+    widths = [before, *(len(outputs[name]) for name in names)]
     columns = dict(zip(names, pairwise(np.cumsum(widths).tolist()), strict=True))
-    table = np.full((len(session.k), sum(widths)), nan)
-    row = row[: sum(widths[1:])]
+    table, row = np.full((len(session.k), sum(widths)), nan), np.asarray(logged.controller.row)[: sum(widths[1:])]
+    u = slice(*columns["u"])
 
     places = np.full(len(session.controller), -1, dtype=np.int32)
     its = np.flatnonzero(session.at_controller >= 0)
     places[session.at_controller[its]] = its
     over = np.isin(_column(session.plant, session.at_plant, "sent_as"), (Sent.NONE, -1), invert=True)
-    state_before = np.empty_like(state)
-    u = slice(*columns["u"])
-    inputs = [session.controller[name] for name in ("tick", "received_as", "measurement")]
-    for i, (tick, received_as, frame, place) in enumerate(in_rows([*inputs, places], progress)):
-        logged.resume(i)
-        state_before[:] = state
-        if logged.answer(tick, received_as, frame) is not None and place >= 0:
+    for i, answer in enumerate(logged.answers(progress)):
+        if answer is not None and (place := places[i]) >= 0:
             over[place] = False
             if outputs["measured"][0]:
-                table[place, : len(state)] = state_before
-                table[place, len(state) :] = row
+                table[place, :before] = logged.state_before
+                table[place, before:] = row
                 if not outputs["computed"][0]:
                     table[place, u] = nan
     missed = np.flatnonzero(over)
@@ -381,9 +344,8 @@ def clock_offset(forward: Array, backward: Array) -> Array:
         forward  = received by the controller − sent by the plant      = delay of the measurement + offset
         backward = received by the plant − sent by the controller      = delay of the command     − offset
 
-    The offset is half their difference if both ways are equally fast. It is fitted by a straight line over windows of
-    512 ticks, through the half with the shortest round trips. Why: queues and hitches only lengthen a delay. A
-    difference of the medians stays in both delays, with opposite signs. Shapes (n,), NaN where a time is unknown.
+    The offset is half their difference if both ways are equally fast. It is fitted by a straight line over windows,
+    through the half with the shortest round trips, as queues only lengthen a delay. Shapes (n,), NaN for unknown times.
     """
     found, last_ns = np.empty(len(forward)), nan
     for part in np.array_split(np.arange(len(forward)), max(1, round(len(forward) / WINDOW))):
@@ -401,13 +363,9 @@ def clock_offset(forward: Array, backward: Array) -> Array:
 
 
 def _timed(session: Session) -> tuple[Integers, Integers, Array, Array, Array, tuple[float, float]]:
-    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`.
-
-    In lockstep the plant waits for each command, so no duration is a loop's.
-    """
-    rows, plant, at, at_plant, acted = (
-        session.controller, session.plant, session.at_controller, session.at_plant, session.acted
-    )  # fmt: skip
+    """Wall time, time of sending, latency and both delays of each tick [ns], and `Recomputed.offset_ns`."""
+    rows, plant = session.controller, session.plant
+    at, at_plant, acted = session.at_controller, session.at_plant, session.acted
     sent = _column(plant, at_plant, "sent")
     wall = np.where(
         at_plant >= 0,

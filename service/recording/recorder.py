@@ -1,13 +1,9 @@
 """Recorder process: writes what every role publishes into MCAP files.
 
-It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late, is
-restarted or was cut off recovers the last minute, the newest messages first: a file is in the order of arrival. Twice a
-second it takes the received messages and writes them, so log times are exact to 0.5 s. A channel per key holds the raw
-payloads, decoded channels are written at a bounded rate, and losses are published and recorded.
-
-A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches. While the disk refuses,
-nothing is taken: messages wait where they are received, and then in their caches. A recorder that is stopped first
-takes what caches still hold.
+It only subscribes, and recovers from publishers' caches what it did not receive, the newest messages first. Twice a
+second it takes the received messages and writes them, so log times are exact to 0.5 s and a crash costs the open chunk
+and 0.5 s, which the restarted recorder recovers. While the disk refuses, nothing is taken: messages wait where they are
+received, and then in their caches.
 """
 
 from __future__ import annotations
@@ -32,7 +28,6 @@ if TYPE_CHECKING:
 WORK_EVERY_S: Final = 0.5  # messages can wait: a chunk is closed only once a second
 STATUS_EVERY_S: Final = 1.0
 DECODED_HZ: Final = 10.0  # of each decoded channel beside the raw messages; `log export --format mcap` has all
-AT_ONCE: Final = 2000  # messages written before anything else is done: the service manager expects a status
 END_S: Final = 8.0  # longest time for what caches hold when recording ends; a service manager kills after 10
 
 
@@ -69,8 +64,7 @@ class Recorder:
                     self._publish_status()
                     status_due = time.monotonic() + STATUS_EVERY_S
                 self.log.tend()
-                pause_s = WORK_EVERY_S if self._complete() or self.log.trouble else SOON_S
-                stopped = self._role.stop.wait(0.0 if self._behind else pause_s)
+                stopped = self._role.stop.wait(WORK_EVERY_S if self._complete() or self.log.trouble else SOON_S)
         finally:
             self._end()
 
@@ -80,7 +74,7 @@ class Recorder:
         begun = time.monotonic()
         while not (self._complete(begun) or self.log.trouble or time.monotonic() > begun + END_S):
             self._work()
-            time.sleep(0.0 if self._behind else SOON_S)
+            time.sleep(SOON_S)
         for subscriber in self._subscribers:
             for key, age_s in subscriber.silent().items():
                 if "/trace/" in key:
@@ -88,10 +82,10 @@ class Recorder:
                     self._unreachable.append(f"nothing of {key} was received for {age_s:.0f} s: {what}")
                     self._role.event("lost", self._unreachable[-1])
         losses = self._losses(finished=True)
-        self._work_off()
+        self._work(at_last=True)
         self._publish_losses(losses)
         self._publish_status()
-        self._work_off()
+        self._work(at_last=True)
         self.log.close(len(self._waiting))
 
     # ── messages ──
@@ -99,35 +93,16 @@ class Recorder:
     def _complete(self, since: float | None = None) -> bool:
         return all(subscriber.complete(since) for subscriber in self._subscribers)
 
-    @property
-    def _behind(self) -> bool:
-        """Whether messages wait and the disk accepts them."""
-        return not self.log.trouble and len(self._waiting) > 0
-
-    def _work(self) -> None:
-        """Take the received messages, unless older ones are to be written first, and write some of the oldest."""
-        if not self._waiting:
-            self._take()
-        self._write(AT_ONCE)
-
-    def _work_off(self) -> None:
-        self._take()
-        self._write(len(self._waiting))
-
-    def _take(self) -> None:
+    def _work(self, *, at_last: bool = False) -> None:
+        """Take the received messages and write them. While the disk refuses, take none, unless it is the last time."""
         now_ns = time.time_ns()
-        for subscriber in self._subscribers:
+        for subscriber in self._subscribers if at_last or not self.log.trouble else ():
             for received in subscriber.take():
                 address = topics.read_key(received.key)
                 if address is not None and address.topic.name == "description":
                     self._describe(received)
                 self._waiting.append((received, now_ns))
-
-    def _write(self, most: int) -> None:
-        """Write the oldest messages, unless the disk refuses."""
-        for _ in range(most):
-            if not self._behind:
-                return
+        while self._waiting and not self.log.trouble:
             received, at_ns = self._waiting.popleft()
             address, decoded = topics.read_key(received.key), list[Decoded]()
             if self._decoder is not None and address is not None:

@@ -1,6 +1,7 @@
-"""Rolling log: the files of a run, one after another, on a disk that may be full.
+"""Rolling log: the MCAP files of a run, one after another, on a disk that may be full.
 
-A file is closed at a size or an age. The next one begins with the descriptions, which a reader of it alone needs. When
+Messages are collected in a chunk in memory; a closed chunk is compressed and written whole, or kept for the next try. A
+file is closed at a size or an age. The next one begins with the descriptions, which a reader of it alone needs. When
 the disk refuses, nothing is dropped here: `trouble` says why, the caller keeps its messages, and `tend` tries again
 every second: on a full disk in the same file, after any other error in a new one.
 """
@@ -9,13 +10,15 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import struct
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
+from importlib.resources import files
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -23,23 +26,28 @@ from typing import Final
 from mcap.exceptions import McapError
 from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.runtime.host import versions
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.mcap_file import RECORDER_METADATA
-from aeroloop.service.recording.log_file import LogFile
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, RECORDER_METADATA, with_checksum
 from aeroloop.service.settings import RecorderSettings
-from aeroloop.service.viewers.schemas import Decoded
+from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
-CHUNK_S: Final = 1.0
-"""A chunk is written this often: the most that a crash or a power cut costs [s]."""
-MAX_FILE_S: Final = 3600.0
-"""A new file begins after this time: what a viewer opens at once [s]."""
+CHUNK_S: Final = 1.0  # a chunk is written this often: the most that a crash or a power cut costs
+MAX_FILE_S: Final = 3600.0  # a new file begins after this time: what a viewer opens at once
 RETRY_S: Final = 1.0
-REMIND_S: Final = 60.0
-"""How often a fault that lasts is reported again [s]."""
+REMIND_S: Final = 60.0  # how often a fault that lasts is reported again
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _BY_TIME: Final = "aeroloop-%Y%m%d-%H%M%S.mcap"
+_TRACE: Final = Shape(
+    "aeroloop.Trace",
+    "x-aeroloop-trace",
+    b"batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description",
+    "x-aeroloop-trace",
+)
 
 
 class RecorderError(AeroloopError):
@@ -63,6 +71,102 @@ def log_path(place: Path, named: str) -> Path:
     return place / datetime.now().strftime(named)
 
 
+class LogFile:
+    """A new MCAP file, with a channel per key. Raises OSError if it exists already or cannot be created.
+
+    It is the stream that its own writer writes to; `size` is its bytes on the disk.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0
+        self._file = path.open("xb", buffering=0)
+        self._pending = bytearray()  # closed chunks and other records that are not yet on the disk
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[Shape | None, int] = {None: 0}
+        self._writer = Writer(self, chunk_size=CHUNK_BYTES, enable_data_crcs=True)  # type: ignore[arg-type]  # a stream
+        self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
+
+    def write(self, data: bytes) -> int:
+        """Add bytes to those that `flush` writes."""
+        self._pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        """Where the next bytes will stand."""
+        return self.size + len(self._pending)
+
+    def flush(self) -> None:
+        """Write the pending bytes through to the disk, or leave the file as it was and raise OSError."""
+        try:
+            with memoryview(self._pending) as pending:
+                written = 0
+                while written < len(pending):
+                    written += os.pwrite(self._file.fileno(), pending[written:], self.size + written)
+            os.fdatasync(self._file.fileno())
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self.size)
+            raise
+        self.size += len(self._pending)
+        self._pending.clear()
+
+    def add(self, received: Delivery, at_ns: int, decoded: Iterable[Decoded] = ()) -> bool:
+        """Add a message that was received at `at_ns` [ns since 1970], and its decoded ones, each at its own time.
+
+        Returns:
+            Whether a chunk is full and waits for `commit`.
+        """
+        if (channel := self._channels.get(received.key)) is None:
+            topic = address.topic if (address := topics.read_key(received.key)) else None
+            shape = json_shape(topic.model) if topic and topic.model else None
+            channel = self._channel(received.key, _TRACE if topic and topic.kind == "trace" else shape)
+        number = received.number & 0xFFFF_FFFF
+        self._writer.add_message(channel, at_ns, received.payload, received.published_ns, number)
+        for one in decoded:
+            self._writer.add_message(self._channel(one.topic, one.shape), one.at_ns, one.data, one.at_ns)
+        return len(self._pending) > 0
+
+    def _channel(self, topic: str, shape: Shape | None) -> int:
+        if topic not in self._channels:
+            if shape is not None and shape not in self._schemas:
+                self._schemas[shape] = self._writer.register_schema(shape.name, shape.encoding, shape.schema)
+            encoding = shape.message_encoding if shape else "application/octet-stream"
+            self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[shape])
+        return self._channels[topic]
+
+    def add_metadata(self, name: str, **entries: str) -> None:
+        """Add a metadata record, under a checksum."""
+        self._writer.add_metadata(name, with_checksum(name, entries))
+
+    def add_description(self, key: str, payload: bytes) -> None:
+        """Add a role's last description as metadata."""
+        self.add_metadata(DESCRIPTION_METADATA, key=key, json=payload.decode())
+
+    def attach(self, name: str, kind: str, data: bytes, at_ns: int) -> None:
+        """Attach a file of a media type."""
+        self._writer.add_attachment(at_ns, at_ns, name, kind, data)
+
+    @property
+    def removed(self) -> bool:
+        """Whether the file has no name any more, or is closed."""
+        return self._file.closed or os.fstat(self._file.fileno()).st_nlink == 0
+
+    def commit(self) -> None:
+        """Close the chunk and write it. Raises OSError; then it is written with the next."""
+        self._writer.flush()
+
+    def end(self) -> None:
+        """Write the last chunk and the index, and close the file. After an OSError only `close` is allowed."""
+        self._writer.finish()
+        self.flush()
+        self.close()
+
+    def close(self) -> None:
+        """Close the file as it is on the disk; drop what is not written."""
+        self._file.close()
+
+
 class RollingLog:
     """A log in files. Raises RecorderError if the first cannot be created.
 
@@ -76,14 +180,11 @@ class RollingLog:
         report: Callable[[str, bool], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.settings = settings
-        self.written = 0
-        self.trouble = ""
+        self.settings, self.written, self.trouble = settings, 0, ""
         self._report, self._clock = report, clock
         self._id = uuid.uuid4().hex
         self._base = log_path(settings.path, _BY_TIME)
-        ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
-        self._runs = re.compile(ours)
+        self._ours = re.escape(self._base.stem) if self._base == settings.path else r"aeroloop-\d{8}-\d{6}"
         self._descriptions: dict[str, bytes] = {}
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []  # in the open chunk
         self._parts = 0  # numbers that were used: none is used twice, even if its file is removed
@@ -130,13 +231,13 @@ class RollingLog:
             RecorderError: Not all could be written; all written before is whole.
         """
         try:
-            if self._file.replaced:
+            if self._file.removed:
                 self._next_file()
             self._file.commit()
             self._unwritten.clear()
             self._end(self._file)
         except OSError as error:
-            self._file.abandon()
+            self._file.close()
             lost = waiting + len(self._unwritten)
             what = f"{lost} messages and the index" if lost else "the index"
             raise RecorderError(
@@ -147,8 +248,8 @@ class RollingLog:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
     def _write(self) -> None:
-        """Write the chunk, into a new file if this one is gone or broken; begin the next file if that is due."""
-        now, last, gone = self._clock(), self.path, self._file.replaced
+        """Write the chunk, into a new file if this one is removed or broken; begin the next file if that is due."""
+        now, last, gone = self._clock(), self.path, self._file.removed
         try:
             if gone or self._broken:
                 self._next_file()
@@ -166,7 +267,7 @@ class RollingLog:
             self.trouble, self._broken = "", False
             self._report(f"recording again to {self.path}", False)
         elif gone:
-            self._report(f"{last} was moved or removed while it was written", True)
+            self._report(f"{last} was removed while it was written", True)
         if self._file.size >= self.settings.max_file_mb * 1e6 or now - self._begun >= MAX_FILE_S:
             try:
                 self._next_file()
@@ -179,29 +280,23 @@ class RollingLog:
         self._report(text, True)
 
     def _next_file(self) -> None:
-        """Begin a new file with what is unwritten, and close the last one. Raises OSError if none can be begun.
-
-        The last one gets what is unwritten, too, if it takes it: where it was moved to, it is whole.
-        """
+        """Begin a new file with what is unwritten, and close the last one. Raises OSError if none can be begun."""
         last = self._file
         if last.removed:
-            last.abandon()  # while it is open, it takes its room from a disk that may be full
+            last.close()  # while it is open, it takes its room from a disk that may be full
         self._file = self._begin()
         self._unwritten.clear()
         try:
             if not last.removed:
                 self._end(last)
         except OSError as error:
-            last.abandon()
+            last.close()
             what = f"the index of {last.path} could not be written: {error.strerror}"
             self._report(f"{what}; `aeroloop log recover` gives it one", True)
         self._remove_oldest()
 
     def _end(self, file: LogFile) -> None:
-        """Put the descriptions at the file's end, too, and close it. Raises OSError.
-
-        Why twice: a damaged copy must not cost the log.
-        """
+        """Put the descriptions at the file's end, too, as a damaged copy must not cost the log, and close it."""
         for key, description in self._descriptions.items():
             file.add_description(key, description)
         file.end()
@@ -214,18 +309,18 @@ class RollingLog:
             path = self._base.with_stem(f"{self._base.stem}-{part:04}")
         file = LogFile(path)
         try:
-            started = datetime.now(UTC)
-            run = {"run": self._base.stem, "id": self._id, "part": path.stem}
-            run["started"] = started.isoformat(timespec="seconds")
-            file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
-            file.attach_specification(round(started.timestamp() * 1e9))
+            now, text = datetime.now(UTC), files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
+            started = now.isoformat(timespec="seconds")
+            run = {"run": self._base.stem, "id": self._id, "part": path.stem, "started": started}
+            file.add_metadata(RECORDER_METADATA, json=json.dumps(run))
+            file.attach("protocol/SPEC.md", "text/markdown", text, round(now.timestamp() * 1e9))  # to read frames by
             for key, description in self._descriptions.items():
                 file.add_description(key, description)
             for entry in self._unwritten:
                 file.add(*entry)
             file.commit()
         except OSError:
-            file.abandon()
+            file.close()
             with suppress(OSError):
                 path.unlink()
             raise
@@ -238,14 +333,14 @@ class RollingLog:
             return
         with suppress(OSError):  # a file is gone; the others are removed next time
             others = [path for path in self._base.parent.glob("*.mcap") if path != self.path and self._is_own(path)]
-            stats = sorted((path.stat().st_mtime_ns, path.stat().st_size, path) for path in others)
-            room = keep_gb * 1e9 - self._file.size - sum(size for _, size, _ in stats)
-            for _, size, path in stats:
-                if room >= 0:
+            sizes = {path: path.stat().st_size for path in sorted(others, key=lambda path: path.stat().st_mtime_ns)}
+            excess = self._file.size + sum(sizes.values()) - keep_gb * 1e9
+            for path, size in sizes.items():
+                if excess <= 0:
                     return
                 with suppress(OSError):
                     path.unlink()
-                    room += size
+                    excess -= size
                     self._report(f"removed {path}, the oldest, to keep logs under {keep_gb:g} GB", False)
 
     def _is_own(self, path: Path) -> bool:
@@ -254,5 +349,5 @@ class RollingLog:
             _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
             if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                return run["part"] == path.stem and self._runs.fullmatch(run["run"]) is not None
+                return run["part"] == path.stem and re.fullmatch(self._ours, run["run"]) is not None
         return False

@@ -235,7 +235,6 @@ def replay_sheets(replay: Replay) -> Sheets:
         for plant in replay.plants
         if (other := plant.first_difference) is not None
     ]
-    lines += [f"{end}: {line}" for end, details in replay.details.items() for line in details]
     lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import degrees, nan, sqrt
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from foxglove import messages as foxglove
@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Event, Loss, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message, MessageError, Setpoint
-from aeroloop.protocol.messages.trace import Sent, read_batch
+from aeroloop.protocol.messages.trace import ENDS, Sent, read_batch
 from aeroloop.protocol.wire import attitude
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -27,7 +27,7 @@ from aeroloop.service.viewers.schemas import Attitude, Decoded, Tracking, Voltag
 
 WORLD: Final = "world"
 ROLES: Final = ("plant", "controller", "recorder")
-"""Roles with a status topic from the start; statuses of other roles are decoded, too."""
+"""Roles with a status topic."""
 
 _ATTITUDE, _STATUS = json_shape(Attitude), json_shape(Status)
 _POSE: Final = protobuf_shape(foxglove.PoseInFrame.get_schema())
@@ -56,17 +56,12 @@ _Shown = dict[str, Any]
 """What is shown, by names of topics: models, or messages of Foxglove's."""
 
 
-def topic_of(vehicle: str, name: str) -> str:
-    """A topic of a vehicle, such as `/aero/pose`; for names see SHAPES."""
-    return f"/{vehicle}/{name}"
-
-
 class _Wire:
     """Frame formats of a vehicle by its description. Raises ValidationError, KeyError or TypeError."""
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: Description, published_ns: int) -> None:
         spec = WireSpec.model_validate(description.config["wire"])
-        self.role = description.role
+        self.published_ns = published_ns
         self.kind = str(description.config["plant"]["kind"])
         self.period = LoopSettings.model_validate(description.config["loop"]).period
         self.formats = {"measurement": spec.measurement, "command": spec.command}
@@ -87,23 +82,19 @@ class Decoder:
         self.malformed = 0
         self._slot_ns = 0 if rate_hz is None else max(1, round(1e9 / rate_hz))
         self._slots: dict[tuple[str, str], int] = {}
-        self._wires: dict[str, _Wire] = {}
-        self._described: dict[tuple[str, str], int] = {}  # when each role's newest description was published
+        self._wires: dict[tuple[str, str], _Wire] = {}  # by vehicle and role
 
     def configure(self, description: Description, published_ns: int = 0) -> None:
-        """Decode a vehicle's frames by this description from now on; before the first, frames and rows are dropped.
+        """Decode a vehicle's frames by this description, unless it is older than the last of its role.
 
-        A controller's is used until there is a plant's: the plant decides which frames it accepts. Other roles' are
-        ignored, as a recorder's configuration need not match the wire; so is one that is older than the last.
+        Before the first, frames and rows are dropped. The plant's counts, as the plant decides which frames it
+        accepts; the controller's counts until there is one.
         """
-        known, which = self._wires.get(description.vehicle), (description.vehicle, description.role)
-        of_plant = known is not None and known.role == "plant"
-        if published_ns < self._described.get(which, 0):
-            return
-        if description.role == "plant" or (description.role == "controller" and not of_plant):
+        which = description.vehicle, description.role
+        known = self._wires.get(which)
+        if description.role in ENDS and (known is None or known.published_ns <= published_ns):
             try:
-                self._wires[description.vehicle] = _Wire(description)
-                self._described[which] = published_ns
+                self._wires[which] = _Wire(description, published_ns)
             except (ValidationError, KeyError, TypeError):
                 self.malformed += 1
 
@@ -113,26 +104,25 @@ class Decoder:
         Nothing if it is not due, malformed, or not shown, or if a frame says that nothing has changed. A description
         configures the decoder.
         """
-        vehicle, topic, wire = address.vehicle, address.topic, self._wires.get(address.vehicle)
+        vehicle, topic = address.vehicle, address.topic
+        wire = self._wires.get((vehicle, "plant")) or self._wires.get((vehicle, "controller"))
         try:
             if topic.name == "description":
                 self.configure(Description.decode(payload), published_ns)
-                return []
-            if topic.kind == "trace":
+            elif topic.kind == "trace":
                 return self._rows(vehicle, wire, payload)
-            if topic.kind == "frame":
-                if wire is None or (payload == UNCHANGED and topic.name in wire.on_change):
-                    return []
-                return self._frame(vehicle, wire, topic.name, payload, published_ns)
-            if topic.model is None or not topic.decoded:
-                return []
-            if topic.decoded == "limited" and not self._due(topic.name, vehicle, published_ns):
-                return []
-            message = topic.model.model_validate_json(payload)
-            return _encoded(vehicle, _converted(message, address, wire, published_ns), published_ns)
+            elif topic.kind == "frame":
+                if wire is not None and not (payload == UNCHANGED and topic.name in wire.on_change):
+                    return self._frame(vehicle, wire, topic.name, payload, published_ns)
+            elif topic.decoded == "always" or (
+                topic.decoded == "limited" and self._due(topic.name, vehicle, published_ns)
+            ):
+                assert topic.model is not None
+                message = topic.model.model_validate_json(payload)
+                return _encoded(vehicle, _converted(message, address, wire, published_ns), published_ns)
         except (ValueError, OverflowError, MessageError):  # untrusted publishers may send anything, such as 1e999
             self.malformed += 1
-            return []
+        return []
 
     def _due(self, name: str, vehicle: str, at_ns: int) -> bool:
         """Whether it is the first of its topic and vehicle in its slot of time."""
@@ -158,10 +148,8 @@ class Decoder:
         return found
 
     def _frame(self, vehicle: str, wire: _Wire, name: str, payload: bytes, at_ns: int) -> list[Decoded]:
-        unpacked = wire.formats[name].unpack(payload)
-        if unpacked is None:
-            self.malformed += 1
-            return []
+        if (unpacked := wire.formats[name].unpack(payload)) is None:
+            raise ValueError("malformed frame")
         _, codes = unpacked
         if name == "command":
             return _encoded(vehicle, {name: _voltages(wire, codes)}, at_ns)
@@ -177,8 +165,7 @@ def _encoded(vehicle: str, shown: _Shown, at_ns: int) -> list[Decoded]:
     found = []
     for name, content in shown.items():
         data = content.model_dump_json().encode() if isinstance(content, BaseModel) else content.encode()
-        shape = SHAPES.get(name, _STATUS)  # any role may publish a status
-        found.append(Decoded(topic_of(vehicle, name), shape, data, at_ns))
+        found.append(Decoded(f"/{vehicle}/{name}", SHAPES[name], data, at_ns))
     return found
 
 
@@ -194,7 +181,7 @@ def _converted(message: Message, address: topics.Address, wire: _Wire | None, at
             return {"truth": _attitude(message.attitude, message.rate)}
         case Setpoint():
             return {"setpoint": message}
-        case Status():
+        case Status() if address.role in ROLES:
             shown: _Shown = {f"status/{address.role}": message}
             if address.role == "plant" and wire is not None:  # with every status, for a viewer that connects late
                 shown["scene"] = _scene(address.vehicle, wire.kind, at_ns)
@@ -209,7 +196,7 @@ def _converted(message: Message, address: topics.Address, wire: _Wire | None, at
             return {}
 
 
-def _tracking(message: Telemetry, wire: _Wire | None) -> Tracking:
+def _tracking(message: Telemetry, wire: _Wire | None) -> BaseModel:
     x, y, z = message.attitude_error
     scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
     (sign,) = message.state.get("sign", (None,))[:1]
@@ -231,7 +218,7 @@ def _degree(radians: float) -> float:
     return round(degrees(radians), 4) + 0.0  # never −0
 
 
-def _attitude(q: attitude.Quaternion | None, rate: attitude.Vector) -> Attitude:
+def _attitude(q: attitude.Quaternion | None, rate: attitude.Vector) -> BaseModel:
     """Angles, null if they are not known, and rates in the body frame from [rad/s], null where they are NaN."""
     angles = attitude.to_euler(q) if q else (nan, nan, nan)
     return Attitude(**dict(zip(Attitude.model_fields, map(_degree, (*angles, *rate)), strict=True)))
@@ -279,18 +266,19 @@ class _Part(NamedTuple):
     z: float
     size: tuple[float, float, float]  # [m]
     color: tuple[float, float, float]  # red, green and blue
-    kind: Literal["box", "disc", "disc on its side"] = "box"
+    disc: bool = False
+    axis: foxglove.Quaternion = foxglove.Quaternion(w=1.0)
 
 
 _BEAM, _NOSE, _TAIL = (0.35, 0.38, 0.42), (0.85, 0.2, 0.15), (0.15, 0.4, 0.75)  # red points forward
 _AERO: Final = (
     _Part(0.0, 0.0, (0.36, 0.03, 0.03), _BEAM),
-    _Part(0.18, 0.0, (0.14, 0.14, 0.02), _NOSE, "disc"),
-    _Part(-0.18, 0.0, (0.14, 0.14, 0.02), _TAIL, "disc on its side"),
+    _Part(0.18, 0.0, (0.14, 0.14, 0.02), _NOSE, disc=True),
+    _Part(-0.18, 0.0, (0.14, 0.14, 0.02), _TAIL, disc=True, axis=foxglove.Quaternion(x=sqrt(0.5), w=sqrt(0.5))),
 )
 _STAND: Final = (
-    _Part(0.0, -0.17, (0.04, 0.04, 0.3), _BEAM, "disc"),
-    _Part(0.0, -0.33, (0.3, 0.3, 0.02), _BEAM, "disc"),
+    _Part(0.0, -0.17, (0.04, 0.04, 0.3), _BEAM, disc=True),
+    _Part(0.0, -0.33, (0.3, 0.3, 0.02), _BEAM, disc=True),
 )
 _BODY: Final = (_Part(0.0, 0.0, (0.3, 0.2, 0.1), _BEAM), _Part(0.17, 0.0, (0.04, 0.1, 0.05), _NOSE))
 
@@ -305,20 +293,21 @@ def _scene(vehicle: str, kind: str, at_ns: int) -> foxglove.SceneUpdate:
 
 
 def _entity(frame: str, name: str, parts: Sequence[_Part], alpha: float, at_ns: int) -> foxglove.SceneEntity:
-    cubes, cylinders = list[foxglove.CubePrimitive](), list[foxglove.CylinderPrimitive]()
-    for part in parts:
-        aside = foxglove.Quaternion(x=sqrt(0.5), w=sqrt(0.5))
-        turned = aside if part.kind == "disc on its side" else foxglove.Quaternion(w=1.0)
+    def placed(part: _Part) -> dict[str, Any]:
         (length, width, height), (red, green, blue) = part.size, part.color
-        placed: dict[str, Any] = {
-            "pose": foxglove.Pose(position=foxglove.Vector3(x=part.x, z=part.z), orientation=turned),
+        return {
+            "pose": foxglove.Pose(position=foxglove.Vector3(x=part.x, z=part.z), orientation=part.axis),
             "size": foxglove.Vector3(x=length, y=width, z=height),
             "color": foxglove.Color(r=red, g=green, b=blue, a=alpha),
         }
-        if part.kind == "box":
-            cubes.append(foxglove.CubePrimitive(**placed))
-        else:
-            cylinders.append(foxglove.CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **placed))
+
     return foxglove.SceneEntity(
-        timestamp=_timestamp(at_ns), frame_id=frame, id=name, frame_locked=True, cubes=cubes, cylinders=cylinders
+        timestamp=_timestamp(at_ns),
+        frame_id=frame,
+        id=name,
+        frame_locked=True,
+        cubes=[foxglove.CubePrimitive(**placed(part)) for part in parts if not part.disc],
+        cylinders=[
+            foxglove.CylinderPrimitive(bottom_scale=1.0, top_scale=1.0, **placed(part)) for part in parts if part.disc
+        ],
     )

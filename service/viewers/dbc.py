@@ -3,7 +3,7 @@
 A CAN payload is the wire frame byte for byte, so the whole file follows from the `WireSpec`: widths place the signals,
 and the quantizer gives factor, bounds and the code of "no valid value". For a uniform quantizer with half-step dead
 zone, with or without hysteresis, the level of code i is i·l, which a DBC can express. For any other the signal is the
-bare code, and its comment has the formula. Many tools read DBC files as cp1252, so the text is ASCII.
+bare code. Many tools read DBC files as cp1252, so the text is ASCII.
 """
 
 from __future__ import annotations
@@ -116,23 +116,16 @@ def _quantized(quantity: tuple[str, str, str, SignalSpec]) -> dict[str, Any]:
         top = quantizer.limit
         comment += " IEEE 754 double; NaN means: no valid value."
     else:
-        top, choices, formula = quantizer.top, OrderedDict([(quantizer.invalid, "no_valid_value")]), ""
+        top, choices = quantizer.top, OrderedDict([(quantizer.invalid, "no_valid_value")])
         comment += f" Quantized; code {quantizer.invalid} means: no valid value."
-        constants = f"y0 = {quantizer.deadzone!r} and l = {quantizer.step!r}"
-        if isinstance(quantizer, LogarithmicQuantizer):
-            formula = f"sgn(i) * (e(|i| - 1) + e(|i|)) / 2 [{unit or 1}]"
-            constants = (
-                "e(k) = y0 * (yt / y0) ** (k / m) for k < m, else yt + (k - m) * l; "
-                f"y0 = {quantizer.deadzone!r}, yt = {quantizer.threshold!r}, m = {quantizer.growing}"
-                f" and l = {quantizer.step!r}"
-            )
-        elif not isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP):
-            formula = f"sgn(i) * (y0 + l/2 + (|i| - 1) * l) [{unit or 1}]"
-        if formula:
-            unit = ""
-            comment += f" This is the bare code i; the level is 0 for i = 0, else {formula} with {constants}."
-        else:
+        half = isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP)
+        if half and isinstance(quantizer, UniformQuantizer):
             scale = quantizer.step
+        else:
+            comment += (
+                f" This is the bare code, whose level [{unit or 1}] has no factor: see aeroloop's SPEC.md, section 2."
+            )
+            unit = ""
     return {
         "name": name, "length": spec.bits or 64, "is_signed": True, "unit": unit, "comment": comment,
         "conversion": BaseConversion.factory(scale=scale, choices=choices, is_float=spec.bits is None),

@@ -9,27 +9,24 @@ loop.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from itertools import chain
+from collections.abc import Callable
+from itertools import islice
 from threading import Event
 from typing import Final
 
 import foxglove
-import zenoh
-from zenoh.handlers import Handler, RingChannel
+from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.history import Delivery, RecoveringSubscriber, read_sample
+from aeroloop.protocol.transport.history import RecoveringSubscriber, read_sample
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.service.viewers.channels import SHAPES, Decoder, topic_of
-from aeroloop.service.viewers.schemas import Decoded, Shape
+from aeroloop.service.viewers.channels import SHAPES, Decoder
+from aeroloop.service.viewers.schemas import Decoded
 
-ROOM: Final = 1024
-"""Events, losses or statuses that may wait to be taken; of streaming topics, one message."""
-BACKLOG: Final = 256
-"""Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
+ROOM: Final = 1024  # events, losses or statuses that may wait to be taken; of streaming topics, one message
+BACKLOG: Final = 256  # messages that wait for one slow client, about a second of all; beyond, its oldest are dropped
 
 
 class FoxgloveServerError(AeroloopError):
@@ -39,22 +36,25 @@ class FoxgloveServerError(AeroloopError):
 class FoxgloveServer:
     """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
 
-    Topics of the vehicle exist from the start; port 0 is any free one; clients connect to `url`.
-
-    Raises:
-        FoxgloveServerError: It cannot listen there.
+    Port 0 is any free one; clients connect to `url`. Raises FoxgloveServerError if it cannot listen there.
     """
 
     def __init__(self, vehicle: str, address: str, port: int) -> None:
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # no log line for each client
-        self._context = foxglove.Context()
-        self._channels: dict[str, foxglove.Channel] = {}
-        for name, shape in SHAPES.items():
-            self._open(topic_of(vehicle, name), shape)
+        self._context = context = foxglove.Context()  # channels and server live as long
+        self._channels = {
+            topic: foxglove.Channel(
+                topic,
+                schema=foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema),
+                message_encoding=shape.message_encoding,
+                context=context,
+            )
+            for topic, shape in ((f"/{vehicle}/{name}", shape) for name, shape in SHAPES.items())
+        }
         host = f"[{address}]" if ":" in address else address
         try:
             self._server = foxglove.start_server(
-                name=f"aeroloop {vehicle}", host=address, port=port, context=self._context, message_backlog_size=BACKLOG
+                name=f"aeroloop {vehicle}", host=address, port=port, context=context, message_backlog_size=BACKLOG
             )
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
@@ -67,19 +67,10 @@ class FoxgloveServer:
 
     def __exit__(self, *_: object) -> None:
         self._server.stop()
-        for channel in self._channels.values():
-            channel.close()
 
     def send(self, message: Decoded) -> None:
         """Send a message to the clients that subscribe to its topic. Never blocks."""
-        channel = self._channels.get(message.topic) or self._open(message.topic, message.shape)
-        channel.log(message.data, log_time=message.at_ns)
-
-    def _open(self, topic: str, shape: Shape) -> foxglove.Channel:
-        schema = foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema)
-        channel = foxglove.Channel(topic, schema=schema, message_encoding=shape.message_encoding, context=self._context)
-        self._channels[topic] = channel
-        return channel
+        self._channels[message.topic].log(message.data, log_time=message.at_ns)
 
 
 def serve(
@@ -103,15 +94,8 @@ def serve(
         rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
         ready(outlet.url)
         while not stop.wait(1 / rate_hz):
-            for received in chain(descriptions.take(), *(_taken(ring, room) for ring, room in rings)):
+            taken = [sample for ring, room in rings for sample in islice(iter(ring.try_recv, None), room)]
+            for received in (*descriptions.take(), *map(read_sample, taken)):
                 if topic := topics.read_key(received.key):
                     for message in decoder.take(topic, received.payload, received.published_ns):
                         outlet.send(message)
-
-
-def _taken(ring: zenoh.Subscriber[Handler[zenoh.Sample]], room: int) -> Iterator[Delivery]:
-    """What waits in a ring: of a streaming topic the newest message, of another all."""
-    for _ in range(room):
-        if (sample := ring.try_recv()) is None:
-            return
-        yield read_sample(sample)

@@ -12,7 +12,7 @@ import re
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, create_model
 
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
@@ -80,48 +80,31 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
             return None
 
 
-# ── views; any value may be null ──
-
-_Number = float | None
+# ── views: units stand in their fields' names, and any value may be null ──
 
 
-class Attitude(BaseModel):
-    """Attitude and rates."""
-
-    roll_deg: _Number = Field(description="Z–Y–X, body relative to inertial [deg]")
-    pitch_deg: _Number = Field(description="likewise [deg]")
-    yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
-    p_deg_s: _Number = Field(description="rate about the body's x axis [deg/s]")
-    q_deg_s: _Number = Field(description="rate about the body's y axis [deg/s]")
-    r_deg_s: _Number = Field(description="rate about the body's z axis [deg/s]")
+def _view(name: str, fields: str, **others: type) -> type[BaseModel]:
+    """A model of numbers by their names; `others` have another type."""
+    types = dict.fromkeys(fields.split(), float) | others
+    optional: dict[str, Any] = {field: (kind | None, None) for field, kind in types.items()}
+    made: type[BaseModel] = create_model(name, **optional)
+    return made
 
 
-Voltages: Final[type[BaseModel]] = create_model(
-    "Voltages",
-    __doc__="Voltages as commanded, quantized; null: no valid value, or no such motor.",
-    **{f"voltage_{i}_v": (_Number, Field(None, description=f"u{i} [V]")) for i in MOTORS},
-    **{f"saturated_{i}": (bool | None, Field(None, description="is at the outermost level")) for i in MOTORS},
-)  # type: ignore[call-overload]  # fields by their names
-
-
-class Tracking(BaseModel):
-    """How well the body follows its reference, as the controller saw it at one tick."""
-
-    time_s: _Number = Field(description="on the law's clock; null if its period is not known [s]")
-    error_deg: _Number = Field(description="angle from the desired to the measured attitude, 0…180 [deg]")
-    roll_deg: _Number = Field(description="measured; Z–Y–X, body relative to inertial [deg]")
-    pitch_deg: _Number = Field(description="likewise [deg]")
-    yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
-    desired_roll_deg: _Number = Field(description="Z–Y–X, body relative to inertial [deg]")
-    desired_pitch_deg: _Number = Field(description="likewise [deg]")
-    desired_yaw_deg: _Number = Field(description="likewise, −180…180 [deg]")
-    error_p_deg_s: _Number = Field(description="ω_e about the body's x axis [deg/s]")
-    error_q_deg_s: _Number = Field(description="ω_e about the body's y axis [deg/s]")
-    error_r_deg_s: _Number = Field(description="ω_e about the body's z axis [deg/s]")
-    damping_1: _Number = Field(description="θ̂₁; null with another law than the paper's [N·m·s/rad]")
-    damping_2: _Number = Field(description="θ̂₂ [N·m·s/rad]")
-    damping_3: _Number = Field(description="θ̂₃ [N·m·s/rad]")
-    sign: int | None = Field(description="the equilibrium approached, z₁₊ or z₁₋; null with a law that has none")
+Attitude: Final = _view("Attitude", "roll_deg pitch_deg yaw_deg p_deg_s q_deg_s r_deg_s")
+"""Attitude by Z–Y–X, body relative to inertial, and rates about the body's axes."""
+Voltages: Final = _view(
+    "Voltages", " ".join(f"voltage_{i}_v" for i in MOTORS), **{f"saturated_{i}": bool for i in MOTORS}
+)
+"""Voltages as commanded, quantized, and whether each is at the outermost level; null: no valid value, or no motor."""
+Tracking: Final = _view(
+    "Tracking",
+    "time_s error_deg roll_deg pitch_deg yaw_deg desired_roll_deg desired_pitch_deg desired_yaw_deg "
+    "error_p_deg_s error_q_deg_s error_r_deg_s damping_1 damping_2 damping_3",
+    sign=int,
+)
+"""The controller at one tick: the law's time, the angle of the error, the attitude as measured and as desired, ω_e,
+θ̂ of the paper's law [N·m·s/rad], and the sign of the equilibrium that it approaches."""
 
 
 # ── panels ──

@@ -176,5 +176,5 @@ def by_mcap(path: Path) -> list[Read]:
     with path.open("rb") as file:
         return [
             Read(channel.topic, one.sequence, one.log_time, one.publish_time, one.data)
-            for _, channel, one in make_reader(file).iter_messages(log_time_order=False)
+            for _, channel, one in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
         ]

@@ -26,8 +26,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
-from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
-from aeroloop.service.recording.log_file import LogFile
+from aeroloop.service.recording.rolling import LogFile
 from tests.support.plant_end import claim_of
 
 START_NS: Final = 1_800_000_000_000_000_000  # when tick 0 is measured, on the plant's wall clock
@@ -107,8 +106,7 @@ def write(
     log = LogFile(path)
     for role in roles:
         key = topics.key("description", VEHICLE, role=role)
-        said = description((its or {}).get(role, settings), role).model_dump_json()
-        log.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": said})
+        log.add_description(key, description((its or {}).get(role, settings), role).model_dump_json().encode())
     numbers: Counter[str] = Counter()
     for i, (at_ns, key, payload, published_ns) in enumerate(messages):
         log.add(Message(key, payload, numbers[key], published_ns, None), at_ns)

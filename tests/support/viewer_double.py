@@ -78,17 +78,13 @@ class Shown(NamedTuple):
 class Viewer:
     """A client of a server in Foxglove's protocol. A context.
 
-    Args:
-        url: The server's.
-        max_queue: Messages that may wait here before it stops to read from the network.
-
     Attributes:
         info: What the server said of itself.
         channels: What it has advertised so far, by topic.
     """
 
-    def __init__(self, url: str, max_queue: int | None = None) -> None:
-        self._connecting = connect(url, subprotocols=[SUBPROTOCOL], max_queue=max_queue, close_timeout=0.5)
+    def __init__(self, url: str) -> None:
+        self._connecting = connect(url, subprotocols=[SUBPROTOCOL], max_queue=None, close_timeout=0.5)
         self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
         self._topics: dict[int, str] = {}

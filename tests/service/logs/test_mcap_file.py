@@ -33,15 +33,10 @@ TICKS: Final = 600
 
 def read(path: Path, damages: list[str]) -> list[Read]:
     """Every message."""
-    channels: dict[int, str] = {}
-    found = []
-    for record in records(path, damages):
-        if isinstance(record, Channel):
-            channels[record.id] = record.topic
-        elif isinstance(record, Message):
-            topic = channels[record.channel_id]
-            found.append(Read(topic, record.sequence, record.log_time, record.publish_time, record.data))
-    return found
+    found = list(records(path, damages))
+    topics = {one.id: one.topic for one in found if isinstance(one, Channel)}
+    messages = (one for one in found if isinstance(one, Message))
+    return [Read(topics[m.channel_id], m.sequence, m.log_time, m.publish_time, m.data) for m in messages]
 
 
 def after(messages: list[Read]) -> str:
@@ -60,9 +55,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def everything(whole: Path) -> list[Read]:
     return by_mcap(whole)
-
-
-# Broken files
 
 
 def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
@@ -144,23 +136,21 @@ def test_a_log_of_a_killed_recorder_is_read_up_to_the_damage(
     assert recover(killed, tmp_path / "out.mcap").lost == damages
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(seed: int, tmp_path: Path) -> None:
-    """40 files each: cut, or with up to three bits flipped, some without their index; a quarter in a description."""
-    log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261201 + seed)
+def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(tmp_path: Path) -> None:
+    """Cut, or with up to three bits flipped, some without their index; a quarter in a description."""
+    log, broken, rng = tmp_path / "a.mcap", tmp_path / "b.mcap", random.Random(20261201)
     make_log(log, 200, changes={120: AN_OPERATORS_WORDS[120]}, chunk_every=4, truth_every=20)
     data, clean, same = log.read_bytes(), read_run(log), replay([log])
     descriptions = [i for i in range(len(data)) if data.startswith(b'{"protocol":2', i)]
     assert len(descriptions) == 2  # uncompressed, of two roles
     refused: list[str] = []
-    for i in range(40):
+    for i in range(48):
         described = i % 4 == 0
         bent = bytearray(data if described or rng.random() < 0.6 else data[: rng.randrange(len(data))])
         if described:  # its JSON, its name or its length
             bent[rng.choice(descriptions) + rng.randrange(-100, 1500)] ^= 1 << rng.randrange(8)
-        for _ in range(0 if described else rng.randrange(4)):
-            if bent:
-                bent[rng.randrange(len(bent))] ^= 1 << rng.randrange(8)
+        for _ in range(0 if described or not bent else rng.randrange(4)):
+            bent[rng.randrange(len(bent))] ^= 1 << rng.randrange(8)
         broken.write_bytes(bent)
         try:
             found, again = read_run(broken), replay([broken])
@@ -169,14 +159,13 @@ def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_wo
             assert not described
             continue
         assert not again.differs
-        named = found.findings.damages or found.findings.missing or found.findings.unknown
         unlike = {"damages", "log"}
         if found.figures.model_dump(exclude=unlike) != clean.figures.model_dump(exclude=unlike):
-            assert named
+            assert found.findings.damages or found.findings.missing or found.findings.unknown
             assert not described
         if again.controller != same.controller or again.plant != same.plant:
             assert not again.complete or again.reasons
-    assert len(refused) < 15
+    assert len(refused) < 18
     assert all(len(line.splitlines()) == 1 for line in refused)
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from mcap.reader import make_reader
 from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
@@ -31,6 +30,7 @@ from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
 from tests.support.cable import Cable
+from tests.support.edited_log import by_mcap, contents
 from tests.support.made_log import description, made
 from tests.support.zenoh_network import Gathering, eventually, free_port
 
@@ -81,12 +81,7 @@ class Running:
 
     def messages(self) -> list[tuple[str, int, bytes]]:
         """Key, number and payload, in the order of arrival."""
-        found = []
-        for path in parts(self.path):
-            with path.open("rb") as file:
-                read = make_reader(file).iter_messages(log_time_order=False)
-                found += [(channel.topic, one.sequence, one.data) for _, channel, one in read]
-        return found
+        return [(one.topic, one.sequence, one.data) for path in parts(self.path) for one in by_mcap(path)]
 
     def of(self, key: str) -> list[bytes]:
         """Payloads of one publisher, by its numbers."""
@@ -137,7 +132,7 @@ class Publisher:
     """Publishes messages from a cache of 65 000."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.session, self.count = session, 0
+        self.count = 0
         self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
 
     def send(self, until: int, size: int = 1) -> None:
@@ -161,9 +156,7 @@ def publish_without_cache(gathering: Gathering, key: str, messages: dict[int, by
 
 def descriptions(path: Path) -> dict[str, bytes]:
     """The last description of each key that a file has as metadata."""
-    with path.open("rb") as file:
-        metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-    return {entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA}
+    return {entry["key"]: entry["json"].encode() for name, entry in contents(path)[1] if name == DESCRIPTION_METADATA}
 
 
 # ── what is recorded ──
@@ -194,19 +187,6 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert running.losses() == []
         assert descriptions(parts(running.path)[-1])[DESCRIPTION] == published[DESCRIPTION][0]
         assert 0 < len(running.of("/aero/pose")) <= 11  # of a second; rows before the description are not decoded
-
-
-def test_a_description_that_is_recovered_after_a_newer_one_does_not_replace_it(
-    gathering: Gathering, record: Record
-) -> None:
-    running = record()
-    settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
-    publish_without_cache(
-        gathering, DESCRIPTION, {number: description(each, "plant").encode() for number, each in settings.items()}
-    )
-    running.await_written(4)
-    running.end()
-    assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
 
 
 def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
@@ -258,18 +238,21 @@ def test_the_last_message_in_a_log_is_that_recording_stopped_and_traces_that_can
     assert note in str(running.of("aeroloop/aero/event/recorder")[-1])
 
 
-def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothing(
+def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and_replace_none(
     gathering: Gathering, record: Record
 ) -> None:
-    running = record()
-    session = gathering.join()
-    names = {topics.key(name, "aero", role="plant"): name for name in topics.RECORDED}
+    running, session = record(), gathering.join()
+    names = [topics.key(name, "aero", role="plant") for name in topics.RECORDED if name != "description"]
     publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
-    running.await_written(len(names) + 2)
+    settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
+    said = {number: description(each, "plant").encode() for number, each in settings.items()}
+    publish_without_cache(gathering, DESCRIPTION, said | {2: b"\xff\x00"})
+    running.await_written(len(names) + 5)
     running.end()
-    assert {key for key, _, data in running.messages() if data == b"\xff\x00"} == set(names)
+    assert {key for key, _, data in running.messages() if data == b"\xff\x00"} == {*names, DESCRIPTION}
+    assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
 
 
 # ── what is lost ──

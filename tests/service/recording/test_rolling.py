@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.records import Channel, Message
+from mcap.records import Attachment, Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.copies import recover
@@ -24,6 +23,7 @@ from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded, Shape
+from tests.support.edited_log import by_mcap, contents
 
 KEY, DESCRIPTION = "aeroloop/aero/telemetry", "aeroloop/aero/description/plant"
 START_NS = 1_800_000_000_000_000_000
@@ -114,8 +114,7 @@ def numbers(path: Path, damages: list[str] | None = None) -> list[int]:
 
 def indexed(path: Path) -> tuple[int, int]:
     """How many messages, raw and decoded, mcap's own reader finds by the index; checksums checked."""
-    with path.open("rb") as file:
-        topics = [channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages()]
+    topics = [one.topic for one in by_mcap(path)]
     return topics.count(KEY), topics.count("/aero/x")
 
 
@@ -190,16 +189,15 @@ def test_a_fault_that_lasts_is_tried_every_second_and_reported_every_minute(tmp_
     run.wait(0.0)
     run.log.close(len(run.waiting))
     assert (numbers(path), indexed(path)) == (list(range(100)), (100, 100))
-    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_moved_file_and_a_missing_folder_are_reported(tmp_path: Path) -> None:
+def test_a_removed_file_and_a_missing_folder_are_reported(tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     run = Run(folder / "a.mcap")
     run.take(100)
-    (folder / "a.mcap").rename(tmp_path / "moved")
+    (folder / "a.mcap").unlink()
     run.wait(1.0)
-    assert run.faults() == [f"{folder / 'a.mcap'} was moved or removed while it was written"]
+    assert run.faults() == [f"{folder / 'a.mcap'} was removed while it was written"]
     shutil.rmtree(folder)
     run.take(100)
     assert run.log.trouble == f"{folder / 'a-0001.mcap'} cannot be written: {os.strerror(errno.ENOENT)}"
@@ -209,25 +207,14 @@ def test_a_moved_file_and_a_missing_folder_are_reported(tmp_path: Path) -> None:
     assert numbers(folder / "a-0002.mcap")[-100:] == list(range(100, 200))
 
 
-def test_a_file_that_is_removed_to_make_room_gives_its_room_back_and_one_that_is_removed_at_last_costs_nothing(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rolling, "CHUNK_S", 1.0)
+def test_a_file_that_is_removed_to_make_room_gives_its_room_back(tmp_path: Path, disk: Disk) -> None:
     run = Run(tmp_path / "a.mcap")
     disk.room = 0
     run.take(100)
-    run.wait(1.0)
     (tmp_path / "a.mcap").unlink()
     run.wait(rolling.RETRY_S)
     assert str(tmp_path) not in str([os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")])
     assert run.log.trouble
-    disk.room = EVERYTHING
-    run.wait(rolling.RETRY_S)
-    run.take(100)
-    run.log.path.unlink()
-    run.take(10)
-    run.log.close()
-    assert numbers(run.log.path)[-10:] == list(range(200, 210))
 
 
 def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_recovered(tmp_path: Path, disk: Disk) -> None:
@@ -253,9 +240,12 @@ def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_recovere
 def test_each_file_of_a_run_can_be_read_alone_and_is_no_longer_than_configured_by_more_than_a_chunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_size: bool
 ) -> None:
+    """Also while it is written: a crash costs what came since the last chunk was due."""
     monkeypatch.setattr(rolling, "MAX_FILE_S", 3600.0 if by_size else 0.4)
     run = Run(tmp_path / "a.mcap", max_file_mb=(HEAD + 50_000) / 1e6 if by_size else 256.0)
-    run.take(1200)
+    for _ in range(60):
+        run.take(20)
+        assert sum(len(numbers(path)) for path in parts(tmp_path / "a.mcap")) >= run.count - 51
     run.log.close()
     files, identities = parts(tmp_path / "a.mcap"), set()
     assert [path.name for path in files] == ["a.mcap", *(f"a-{part:04}.mcap" for part in range(1, len(files)))]
@@ -266,11 +256,9 @@ def test_each_file_of_a_run_can_be_read_alone_and_is_no_longer_than_configured_b
     else:
         assert all(399 <= len(numbers(path)) <= 460 for path in files[:-1])
     for path in files:
-        with path.open("rb") as file:
-            reader = make_reader(file)
-            found = [(one.name, dict(one.metadata)) for one in reader.iter_metadata()]
-            attachments = {one.name: one.data for one in reader.iter_attachments()}
-        assert attachments == {"protocol/SPEC.md": Path("protocol/SPEC.md").read_bytes()}
+        (attached,) = [one for one in records(path) if isinstance(one, Attachment)]
+        assert (attached.name, attached.data) == ("protocol/SPEC.md", Path("protocol/SPEC.md").read_bytes())
+        _, found = contents(path)
         description = with_checksum(DESCRIPTION_METADATA, {"key": DESCRIPTION, "json": '{"a":1}'})
         assert [entries for name, entries in found if name == DESCRIPTION_METADATA] == [description] * 2
         (known,) = [json.loads(entries["json"]) for name, entries in found if name == RECORDER_METADATA]
@@ -278,15 +266,6 @@ def test_each_file_of_a_run_can_be_read_alone_and_is_no_longer_than_configured_b
         identities.add(known["id"])
     assert len(identities) == 1
     assert run.reported == []
-
-
-def test_a_crash_costs_what_came_since_the_last_chunk_was_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rolling, "MAX_FILE_S", 0.3)
-    run = Run(tmp_path / "a.mcap")
-    for _ in range(40):
-        run.take(20)
-        assert sum(len(numbers(path)) for path in parts(tmp_path / "a.mcap")) >= run.count - 51
-    run.log.close()
 
 
 def test_no_log_is_written_over_and_where_none_can_be_made_one_line_names_it(tmp_path: Path) -> None:

@@ -17,11 +17,9 @@ from aeroloop.protocol.messages.models import Description, Event, Loss, Truth
 from aeroloop.protocol.messages.operator import Message, Setpoint
 from aeroloop.protocol.messages.trace import ENDS, Sent
 from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.viewers.channels import SHAPES, Decoder
-from aeroloop.service.viewers.schemas import layout
 from tests.support.decoded import (
     ATTITUDE,
     BODY,
@@ -247,6 +245,11 @@ def test_any_bytes_at_any_time_give_something_or_are_counted_and_never_raise(
 # ── schemas ──
 
 
+TYPES: dict[str, type | tuple[type, ...]] = {
+    "boolean": bool, "string": str, "number": (int, float), "integer": int, "array": list, "object": dict
+}  # fmt: skip
+
+
 def readable(schema: dict[str, Any]) -> bool:
     """Whether Lichtblick reads it: its parseJsonSchema.ts."""
     match schema.get("type"):
@@ -255,15 +258,10 @@ def readable(schema: dict[str, Any]) -> bool:
         case "array":
             return schema["items"]["type"] != "array" and readable(schema["items"])
         case kind:
-            return kind in ("boolean", "string", "number", "integer") and not {"oneOf", "anyOf", "$ref"} & set(schema)
+            return kind in TYPES and not {"oneOf", "anyOf", "$ref"} & set(schema)
 
 
-TYPES: dict[str, type | tuple[type, ...]] = {
-    "boolean": bool, "string": str, "number": (int, float), "integer": int, "array": list, "object": dict
-}  # fmt: skip
-
-
-def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:
+def test_every_topic_that_is_given_is_listed_and_is_as_its_schema_says_in_one_that_viewers_read() -> None:
     decoder = configured()
     assert set(RAW) == {
         topic.name for topic in topics.TOPICS.values() if topic.decoded or topic.kind in ("frame", "trace")
@@ -275,20 +273,15 @@ def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says(
     for shown in given:
         if shown.shape.encoding == "jsonschema":
             schema, message = json.loads(shown.shape.schema), said(shown)
+            assert readable(schema)
             assert set(message) == set(schema["properties"])
             for name, value in message.items():
                 assert value is None or isinstance(value, TYPES[schema["properties"][name]["type"]]), name
-
-
-def test_every_schema_is_one_that_viewers_read() -> None:
-    for name, shape in SHAPES.items():
-        if shape.encoding == "jsonschema":
-            assert readable(json.loads(shape.schema)), name
-            continue
-        package, _, message = shape.name.partition(".")
-        files = [fields(file) for file in fields(shape.schema)[1]]  # a FileDescriptorSet
-        declared = {(file[2][0].decode(), fields(found)[1][0].decode()) for file in files for found in file.get(4, [])}
-        assert (package, message) in declared, name
+        else:
+            package, _, kind = shown.shape.name.partition(".")
+            files = [fields(file) for file in fields(shown.shape.schema)[1]]  # a FileDescriptorSet
+            declared = {(file[2][0].decode(), fields(one)[1][0].decode()) for file in files for one in file.get(4, [])}
+            assert (package, kind) in declared
 
 
 # ── layout ──
@@ -304,8 +297,14 @@ def test_every_path_is_a_field_of_a_topic_that_is_decoded_and_voltages_are_those
 ) -> None:
     """A topic with a dot in it stands in quotes."""
     assert execute(["show", "layout", "--set", f"vehicle={vehicle}", "--set", f"wire.actuators={actuators}"]) == 0
-    panels = json.loads(capfd.readouterr().out)["configById"].values()
-    found = [path["value"] for panel in panels for path in panel.get("paths", [])]
+    made = json.loads(capfd.readouterr().out)
+    panels = made["configById"]
+    assert sorted(leaves(made["layout"])) == sorted(panels)
+    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert [name for name, settings in body["topics"].items() if settings["visible"]] == [f"/{vehicle}/scene"]
+    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
+    assert {*body["topics"], log["topicToRender"]} <= {f"/{vehicle}/{name}" for name in SHAPES}
+    found = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
     for path in found:
         parts = re.fullmatch(
             r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)(\.p[59][09])?', path
@@ -316,15 +315,3 @@ def test_every_path_is_a_field_of_a_topic_that_is_decoded_and_voltages_are_those
     shown = {path.rpartition(".")[2] for path in found}
     assert {"pitch_deg", "desired_pitch_deg", "error_deg", "p99", "state"} <= shown
     assert {field for field in shown if field.startswith("voltage")} == {f"voltage_{i}_v" for i in motors}
-
-
-def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws_and_every_panel_has_its_place() -> None:
-    made = json.loads(layout("aero", WireSpec().motors))
-    panels = made["configById"]
-    assert sorted(leaves(made["layout"])) == sorted(panels)
-    (body,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
-    assert set(body["topics"]) <= {f"/aero/{name}" for name in SHAPES}
-    assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
-    assert SHAPES["scene"].name == "foxglove.SceneUpdate"
-    (log,) = (panel for name, panel in panels.items() if name.startswith("RosOut!"))
-    assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"

@@ -6,63 +6,40 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from queue import Queue
 
 import pytest
 
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
-from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
-from aeroloop.service.viewers.schemas import Decoded
-from tests.support.decoded import ATTITUDE, NOW, RAW, STATUS, telemetry
+from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError
+from tests.support.decoded import ATTITUDE, RAW, STATUS, telemetry
 from tests.support.viewer_double import PATIENCE_S, Viewer
 
 TOPICS = {f"/aero/{name}" for name in SHAPES}
 
 
-@pytest.fixture
-def settings() -> Settings:
-    return load(None, ["loop.lockstep=true", f"network.rendezvous={free_rendezvous()}"])
-
-
 @contextmanager
-def serving(network: NetworkSettings) -> Iterator[str]:
-    """`log live` in a thread; gives the URL."""
-    stop, urls = threading.Event(), Queue[str]()
-    options = {"address": "127.0.0.1", "port": 0, "rate_hz": 100.0, "ready": urls.put}
-    thread = threading.Thread(target=serve, args=(network, "aero", stop), kwargs=options)
-    thread.start()
-    try:
-        yield urls.get(timeout=PATIENCE_S)
-    finally:
-        stop.set()
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
-
-
-@contextmanager
-def repeating(act: Callable[[], object]) -> Iterator[None]:
-    """Act a hundred times a second in a thread."""
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.wait(0.01):
-            act()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+def serving(settings: Settings) -> Iterator[str]:
+    """`log live` as a process, which stops on a signal; gives the URL that it prints."""
+    command = [sys.executable, "-P", "-m", "aeroloop", "log", "live", "--port", "0"]
+    command += ["--set", f"network.rendezvous={settings.network.rendezvous}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert "aeroloop show layout --set vehicle=aero" in line
+            yield next(word for word in line.split() if word.startswith("ws://127.0.0.1:"))
+            process.terminate()
+            output, errors = process.communicate(timeout=PATIENCE_S)
+            assert (process.returncode, output, errors) == (0, "", "")
+        finally:
+            process.kill()
 
 
 @contextmanager
@@ -82,14 +59,28 @@ def loop(settings: Settings) -> Iterator[Node]:
 
     plant.announce()
     controller.announce()
-    with repeating(publish):
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.01):
+            publish()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
         yield plant
-    plant.zenoh.close()
-    controller.zenoh.close()
+    finally:
+        stop.set()
+        thread.join()
+        plant.zenoh.close()
+        controller.zenoh.close()
 
 
-def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all(settings: Settings) -> None:
-    with serving(settings.network) as url, Viewer(url) as early:
+@pytest.mark.processes
+def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all() -> None:
+    """The server may take 20 s to start and to stop, where a second is enough."""
+    settings = load(None, ["loop.lockstep=true", f"network.rendezvous={free_rendezvous()}"])
+    with serving(settings) as url, Viewer(url) as early:
         assert early.info["name"] == "aeroloop aero"
         early.await_topics(*TOPICS)
         assert set(early.channels) == TOPICS
@@ -109,27 +100,6 @@ def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all(settings: Sett
             assert all(early.first(f"/aero/{name}").data for name in ("scene", "command", "status/plant"))
 
 
-def test_a_viewer_that_never_reads_delays_no_other() -> None:
-    """40 MB go to it, far more than sockets and the server's backlog hold."""
-    shape = SHAPES["log"]
-    with (
-        FoxgloveServer("aero", "127.0.0.1", 0) as outlet,
-        Viewer(outlet.url, max_queue=1) as stuck,
-        Viewer(outlet.url) as other,
-    ):
-        for viewer in (stuck, other):
-            viewer.await_topics(*TOPICS)
-            viewer.subscribe("/aero/log")
-        with repeating(lambda: outlet.send(Decoded("/aero/log", shape, b"first", NOW))):
-            other.first("/aero/log")  # so the server knows the subscription
-        for _ in range(640):
-            outlet.send(Decoded("/aero/log", shape, bytes(64 * 1024), NOW))
-        outlet.send(Decoded("/aero/log", shape, b"the last", NOW + 1))
-        while (last := other.first("/aero/log")).data != b"the last":
-            assert last.at_ns <= NOW
-        assert last.at_ns == NOW + 1
-
-
 def test_a_port_in_use_is_one_clear_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -139,23 +109,3 @@ def test_a_port_in_use_is_one_clear_line() -> None:
             FoxgloveServer("aero", "127.0.0.1", port)
     where = f"cannot listen on 127.0.0.1:{port}: address already in use"
     assert str(refused.value) == f"{where}; choose by --address and --port"
-
-
-@pytest.mark.processes
-def test_the_command_prints_its_address_and_stops_on_a_signal(settings: Settings) -> None:
-    """A process of its own; it may take 20 s to start and to stop, where a second is enough."""
-    command = [sys.executable, "-P", "-m", "aeroloop", "log", "live", "--port", "0"]
-    command += ["--set", f"network.rendezvous={settings.network.rendezvous}"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            line = process.stdout.readline()
-            assert "aeroloop show layout --set vehicle=aero" in line
-            url = next(word for word in line.split() if word.startswith("ws://127.0.0.1:"))
-            with Viewer(url) as viewer:
-                viewer.await_topics("/aero/pose")
-                process.terminate()
-                output, errors = process.communicate(timeout=PATIENCE_S)
-        finally:
-            process.kill()
-    assert (process.returncode, output, errors) == (0, "", "")
