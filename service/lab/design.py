@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import product, starmap
-from math import asin, degrees
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,10 +18,10 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import SignalBits, WireSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, figures_row, open_workers, run_of
-from aeroloop.service.theorem.certificate import beyond, premises
+from aeroloop.service.theorem.certificate import beyond
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.invariant import reach
-from aeroloop.service.theorem.plant_bounds import paper_body
+from aeroloop.service.theorem.premises import PlantBounds, premises
 
 BITS: Final = range(4, 15)
 """Of each signal."""
@@ -114,7 +113,7 @@ def design(
 
 def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | None]:
     """Every split of full frames at this rate; None where nothing is proven."""
-    desired, bounds, found = extremes(base), paper_body(base), list[Point | None]()
+    desired, bounds, found = extremes(base), PlantBounds(base.loop.period), list[Point | None]()
     for bits, size in _splits(base.wire):
         payload = size * 8 / base.loop.period / 1e3
         if kbit is not None and payload > kbit:
@@ -129,7 +128,7 @@ def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | N
                 rate_hz=base.loop.rate_hz,
                 bits=str(bits),
                 radius=at.radius,
-                degrees=degrees(2 * asin(at.eps_e)),
+                degrees=at.degrees,
                 beyond=[name for *_, name in beyond(split, p, at)],
             )
         found.append(point)

@@ -26,7 +26,7 @@ from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, 
 from aeroloop.service.lab.margins import LONGEST_S, WITHIN_DEG, survived
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import BoundlessError
-from aeroloop.service.theorem.feedback import NoTheoremError
+from aeroloop.service.theorem.premises import NoTheoremError
 
 # ── what is compared ──
 

@@ -7,20 +7,27 @@ with little error. There a bound of half the size would be exceeded, so the chec
 from __future__ import annotations
 
 from dataclasses import replace
-from math import asin, floor, sin, sqrt
+from math import asin, floor, radians, sin, sqrt
 
 import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.operator import Sinusoid
-from aeroloop.protocol.wire.attitude import IDENTITY, Vector, received_quaternion, sent_vector
-from aeroloop.protocol.wire.quantizer import Quantizer
+from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion, sent_vector
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Floats, Trajectory, reference_function
-from aeroloop.service.theorem.bounds import Samples, coordinates, lemma_inequalities, rotation, times
+from aeroloop.service.theorem.bounds import (
+    Samples,
+    coordinates,
+    lemma_1,
+    lemma_inequalities,
+    rotation,
+    theorem_1,
+    times,
+)
 from aeroloop.service.theorem.certificate import Paper, evaluate
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
@@ -50,9 +57,10 @@ LEMMA = tuple(DELTAS)
 
 def bounds(wire: WireSpec, disturbance: float = 0.0) -> Paper:
     settings = Settings(wire=wire, law=LAW, reference=REFERENCE)
-    found = evaluate(settings, disturbance=disturbance, start_deg=15).paper
+    found = evaluate(settings, disturbance=disturbance).paper
     assert found is not None
-    return found
+    known = replace(found.known, half_angle_e=radians(15) / 2)
+    return Paper(known, lemma_1(known), theorem_1(known, lemma_1(known)))
 
 
 def wire_of(bits: int) -> WireSpec:
@@ -91,15 +99,11 @@ def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats
     q *= rng.choice([-1.0, 1.0], (COUNT, 1))  # the truth may be given with either sign
     attitude, rate = wire.attitude.quantizer(), wire.rate.quantizer()
     sent = [sent_vector((w, x, y, z)) for w, x, y, z in q.tolist()]
-    q_Q = np.array([received_quaternion(*_quantized(attitude, eps), IDENTITY) for eps in sent])
-    omega_Q = np.array([[rate.quantize(value) for value in row] for row in omega.tolist()])
+    levels = np.vectorize(attitude.quantize)(sent)
+    q_Q = np.array([received_quaternion(x, y, z, IDENTITY) for x, y, z in levels.tolist()])
+    omega_Q = np.vectorize(rate.quantize)(omega)
     sign = np.where((q * q_d).sum(axis=1) * (q * q_Q).sum(axis=1) >= 0, 1.0, -1.0)
     return Samples(q, omega, q_Q, omega_Q, q_d, omega_d, sign), omega_d_dot
-
-
-def _quantized(quantizer: Quantizer, vector: Vector) -> Vector:
-    x, y, z = vector
-    return quantizer.quantize(x), quantizer.quantize(y), quantizer.quantize(z)
 
 
 def _edge_before(half_angle: float, wire: WireSpec) -> float:
