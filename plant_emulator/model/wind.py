@@ -23,7 +23,7 @@ class WindSettings(BaseModel, extra="forbid"):
     torque: tuple[float, ...] = Field(
         default=(-0.000220, 0.009858),
         max_length=3,
-        description="steady torque about the axes [N·m], missing ones 0; fitted by `lab calibrate`",
+        description="steady torque about the axes [N·m], missing ones 0; fitted to the paper",
     )
     gust: float = Field(
         default=0.2,

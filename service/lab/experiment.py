@@ -87,7 +87,15 @@ def experiment(
             return Experiment(_figures(settings, np.arange(ticks), course, unsent), course, compiled=True)
     if plant is not None:
         return _through_frames(settings, duration_s, progress, watch, plant, controller)
-    with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
+    for fault in settings.plant.parsed_faults:
+        if fault.signal in ("measurement", "command"):
+            raise ValueError(f"fault {fault} acts on frames that cross a network: use `aeroloop demo --lockstep`")
+    made: Plant = settings.plant.make(settings.loop.period)
+    if settings.plant.faults:
+        faulty = settings.plant.with_faults(made, settings.loop.period)
+        faulty.start()
+        made = faulty
+    with closing(made):  # 0 V at the end: it may be a machine
         return _through_frames(settings, duration_s, progress, watch, made, controller)
 
 
@@ -186,19 +194,6 @@ def _through_frames(
     return Experiment(
         _figures(settings, np.array(used, dtype=np.int64), course, (silent[0], silent[1])), course, compiled=False
     )
-
-
-def _plant(settings: Settings) -> Plant:
-    """The plant with its configured faults; faults of frames need a network."""
-    plant: Plant = settings.plant.make(settings.loop.period)
-    if not settings.plant.faults:
-        return plant
-    for fault in settings.plant.parsed_faults:
-        if fault.signal in ("measurement", "command"):
-            raise ValueError(f"fault {fault} acts on frames that cross a network: use `aeroloop demo --lockstep`")
-    faulty = settings.plant.with_faults(plant, settings.loop.period)
-    faulty.start()
-    return faulty
 
 
 def sent_ticks(codes: Floats, policy: Policy, heartbeat: int) -> Integers:

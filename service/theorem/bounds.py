@@ -75,7 +75,7 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1 by (C.77) for V of (C.73), in continuous time; no `radius`: (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1 by (C.77) for V of (C.24), (C.73); no `radius` where (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
