@@ -30,18 +30,14 @@ AEROLOOP: Final = [sys.executable, "-Pm", "aeroloop"]
 
 
 class Turn(NamedTuple):
-    """Figures of one run. Times are in µs, memory in MB of 10⁶ bytes."""
+    """Figures of one run."""
 
     ticks: int
     in_time: int
     skipped: int
-    p50: float
-    p99: float
-    p999: float
-    longest: float
-    wake_p999: float
-    over_lockstep: float
-    memory_mb: float
+    latency_us: dict[str, float]
+    over_lockstep: float  # z_track
+    memory_mb: float  # of the largest process, of 10⁶ bytes
     notes: list[str]
 
 
@@ -63,23 +59,12 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
             processes.eventually("its end", lambda: not processes.running("controller"), seconds + PATIENCE_S)
             plant = processes.statuses["plant"]
         review = json.loads(run("log", "review", f"{folder}/log.mcap", "--json"))
-    trip, period_us = review["latency_us"], 1e6 / rate_hz
     broken = [f"{review['sessions']} sessions instead of one"] if review["sessions"] != 1 else []
-    assert plant.timing is not None
-    assert plant.timing.wake is not None
-    return Turn(
-        ticks=round(seconds * rate_hz) - 1,  # the last one ends the session
-        in_time=sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < period_us),
-        skipped=review["skipped_ticks"],
-        p50=trip["p50"],
-        p99=trip["p99"],
-        p999=trip["p999"],
-        longest=trip["max"],
-        wake_p999=plant.timing.wake.p999,
-        over_lockstep=review["z_track"] / z_track,
-        memory_mb=memory,
-        notes=[*broken, *plant.notes, *review["trips"], *review["damages"]],
-    )
+    in_time = sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < 1e6 / rate_hz)
+    ticks = round(seconds * rate_hz) - 1  # the last one ends the session
+    notes = [*broken, *plant.notes, *review["trips"], *review["damages"]]
+    over_lockstep = review["z_track"] / z_track
+    return Turn(ticks, in_time, review["skipped_ticks"], review["latency_us"], over_lockstep, memory, notes)
 
 
 def run(*words: str) -> str:
@@ -136,10 +121,8 @@ def answer(endpoint: str) -> None:
     """Answer every ping."""
     tree = {"connect": {"endpoints": [endpoint], "exit_on_failure": False}, **NO_SCOUTING}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-        pong, pings = (
-            session.declare_publisher("pong"),
-            session.declare_subscriber("ping", zenoh.handlers.RingChannel(1)),
-        )
+        pong = session.declare_publisher("pong")
+        pings = session.declare_subscriber("ping", zenoh.handlers.RingChannel(1))
         while True:
             pings.recv()
             pong.put(bytes(3))
