@@ -103,16 +103,9 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
 def test_what_a_law_survives_is_the_last_step_before_the_bound() -> None:
     found = survived(PD, S)
     ticks, frames = round(found["delay_ms"] / 10), found["lost_frames"]
-    assert ticks > 0
-    assert frames > 0
+    assert min(ticks, frames) > 0
     for kept, too_late in (((ticks, 0), (ticks + 1, 0)), ((0, frames), (0, frames + 1))):
-        errors = [largest_error_deg(PD, S, *late) for late in (kept, too_late)]
-        assert errors[0] <= WITHIN_DEG < errors[1]
-
-
-def test_a_law_that_runs_away_survives_nothing() -> None:
-    runaway = load(overrides=["loop.rate_hz=100", f"law.kind={FAILING}:Runaway"])
-    assert survived(runaway, S) == {"delay_ms": None, "lost_frames": None}
+        assert largest_error_deg(PD, S, *kept) <= WITHIN_DEG < largest_error_deg(PD, S, *too_late)
 
 
 class Recording(EmulatedPlant):
