@@ -1,4 +1,4 @@
-"""The loop in real time, as a user starts it, and bare Zenoh between two processes: rows for `__main__.py`.
+"""The loop in real time, as a user starts it: rows for `__main__.py`.
 
 Recorder, plant and controller run on TCP loopback for some seconds a turn. Its figures are computed from the turn's log
 and the plant's last status alone.
@@ -17,15 +17,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import numpy as np
-import zenoh
-
 from aeroloop.service.config import load
-from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, standalone
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
 
 PATIENCE_S: Final = 60.0
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
-NO_SCOUTING: Final = {"scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}}}
 AEROLOOP: Final = [sys.executable, "-Pm", "aeroloop"]
 
 
@@ -86,47 +82,3 @@ def cpu_s(pid: int) -> float:
     """CPU time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-# ── the floor: bare Zenoh between two processes at the loop's rate ──
-
-
-def bare_round_trips(seconds: float, rate_hz: float) -> np.ndarray:
-    """Round trips of 7 bytes there and 3 back [µs]."""
-    endpoint = free_rendezvous()
-    tree = {"listen": {"endpoints": [endpoint]}, **NO_SCOUTING}
-    echo = subprocess.Popen([sys.executable, "-m", "tests.benchmarks.loop", endpoint])
-    try:
-        with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-            answers = session.declare_subscriber("pong", zenoh.handlers.RingChannel(1))
-            ping = session.declare_publisher("ping")
-            while answers.try_recv() is None:  # until the other process is there
-                ping.put(bytes(7))
-                time.sleep(0.1)
-            trips = []
-            start = time.perf_counter()
-            for k in range(1, round(seconds * rate_hz)):
-                time.sleep(max(0.0, start + k / rate_hz - time.perf_counter()))
-                begun = time.perf_counter()
-                ping.put(bytes(7))
-                answers.recv()
-                trips.append(1e6 * (time.perf_counter() - begun))
-            return np.array(trips)
-    finally:
-        echo.terminate()
-        echo.wait()
-
-
-def answer(endpoint: str) -> None:
-    """Answer every ping."""
-    tree = {"connect": {"endpoints": [endpoint], "exit_on_failure": False}, **NO_SCOUTING}
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-        pong = session.declare_publisher("pong")
-        pings = session.declare_subscriber("ping", zenoh.handlers.RingChannel(1))
-        while True:
-            pings.recv()
-            pong.put(bytes(3))
-
-
-if __name__ == "__main__":
-    answer(sys.argv[1])

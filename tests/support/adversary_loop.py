@@ -60,19 +60,13 @@ def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
     return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
 
 
-def cross(a: Array, b: Array) -> Array:
-    (x, y, z), (u, v, w) = ((each[..., 0], each[..., 1], each[..., 2]) for each in (a, b))
-    found: Array = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
-    return found
-
-
 def dot(a: Array, b: Array) -> Array:
     product: Array = (a * b).sum(axis=-1, keepdims=True)
     return product
 
 
 def norm(v: Array) -> Array:
-    length: Array = np.sqrt((v * v).sum(axis=-1))
+    length: Array = np.linalg.norm(v, axis=-1)
     return length
 
 
@@ -88,15 +82,15 @@ def by(matrix: Array, v: Array) -> Array:
 
 def to_body(q: Array, v: Array) -> Array:
     """Rᵀ(q) v."""
-    t = 2 * cross(q[..., 1:], v)
-    found: Array = v - q[..., :1] * t + cross(q[..., 1:], t)
+    t = 2 * np.cross(q[..., 1:], v)
+    found: Array = v - q[..., :1] * t + np.cross(q[..., 1:], t)
     return found
 
 
 def times(p: Array, q: Array) -> Array:
     """p ∘ q."""
     (a, b), (s, v) = (p[..., :1], p[..., 1:]), (q[..., :1], q[..., 1:])
-    return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
+    return np.concatenate([a * s - dot(b, v), a * v + s * b + np.cross(b, v)], axis=-1)
 
 
 def attitude_of(angle: Array) -> Array:
@@ -126,16 +120,16 @@ def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
 
 def drift(c: Any, q: Array, omega: Array) -> Array:
     """Ψ: what the body turns by without command and damping."""
-    return cross(c.r_g, to_body(q, c.weight)) - cross(omega, c.J * omega)
+    return np.cross(c.r_g, to_body(q, c.weight)) - np.cross(omega, c.J * omega)
 
 
 def torque_of(c: Any, q: Array, omega: Array, now: Motion, theta: Array, integral: Array) -> tuple[Array, ...]:
     """B u, z₂ and the integral's rate: C₁ = C₂ = 0 leave PD and PID, k_d = k_i = 0 the paper's law."""
     eta_e, eps_e, omega_e, omega_d, omega_d_dot = errors(q, omega, now)
     z2 = omega_e + c.C1 * eps_e
-    alpha_dot = -c.C1 / 2 * (eta_e * omega_e + cross(eps_e, omega_e))
+    alpha_dot = -c.C1 / 2 * (eta_e * omega_e + np.cross(eps_e, omega_e))
     feedback = -c.kp * eps_e - c.C2 * z2 - c.kd * omega_e - c.ki * integral
-    ahead = omega * theta - drift(c, q, omega) - c.J * (cross(omega, omega_d) - omega_d_dot - alpha_dot)
+    ahead = omega * theta - drift(c, q, omega) - c.J * (np.cross(omega, omega_d) - omega_d_dot - alpha_dot)
     return feedback + ahead, z2, omega_e + c.share * eps_e
 
 
@@ -178,7 +172,7 @@ def advance(c: Any, x: State, u: Array, theta: Array, push: Array) -> State:
     torques = [push + by(c.B, each) for each in V]
 
     def slope(q: Array, omega: Array, torque: Array) -> tuple[Array, Array]:
-        q_dot = np.concatenate([-dot(q[:, 1:], omega), q[:, :1] * omega + cross(q[:, 1:], omega)], axis=1) / 2
+        q_dot = np.concatenate([-dot(q[:, 1:], omega), q[:, :1] * omega + np.cross(q[:, 1:], omega)], axis=1) / 2
         omega_dot = (drift(c, q, omega) - theta * omega + torque) / c.J
         n = held_axis(q)  # along it a mechanism's torque keeps n·ω = 0
         n_dot = omega[:, 1:2] * np.stack([-n[:, 2], n[:, 1], n[:, 0]], axis=1)

@@ -108,7 +108,12 @@ def test_a_worker_that_is_killed_costs_no_row_and_no_bit_and_one_with_other_code
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
         out, other, engine = tmp_path / "a.parquet", tmp_path / "b.parquet", f"dask:{cluster.scheduler_address}"
         pid = next(iter(cluster.workers.values())).pid
-        result = run_sweep(planned(), out, engine=engine, progress=lambda n, _: n == 4 and os.kill(pid, signal.SIGKILL))
+
+        def progress(done: int, _total: int) -> None:
+            if done == 4:
+                os.kill(pid, signal.SIGKILL)
+
+        result = run_sweep(planned(), out, engine=engine, progress=progress)
         assert (result.done, result.resumed, result.failed) == (2 * SEEDS, 0, 0)
         assert out.read_bytes() == local
         with Client(cluster.scheduler_address, set_as_default=False) as client:

@@ -36,19 +36,12 @@ def bounds(reference: Sinusoid) -> Floats:
     return np.array([e.rate, e.acceleration, e.axis_rate, e.half_angle, e.tilt, e.eps[0][1], *e.voltages])
 
 
-@pytest.mark.parametrize(
-    ("reference", "step_s", "duration_s"),
-    [
-        (NEARLY_EQUAL, 2.0, 320_000),
-        (SLOW_ROLL, 0.1, 7_000),
-        (UNEVEN, 0.5, 80_000),
-        (PAPER, 0.001, 40),
-        (LOCKED, 0.005, 126),
-    ],
-    ids=["nearly equal", "slow roll", "uneven", "paper", "locked"],
-)
+RUNS = [(SLOW_ROLL, 0.1, 7_000), (UNEVEN, 0.5, 80_000), (PAPER, 0.001, 40), (LOCKED, 0.005, 126)]
+
+
+@pytest.mark.parametrize(("reference", "step_s", "duration_s"), RUNS, ids=["slow roll", "uneven", "paper", "locked"])
 def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step_s: float, duration_s: float) -> None:
-    """At least once through every beat; the first three were exceeded by up to 33 % after some periods."""
+    """At least once through every beat; the first two were exceeded by up to 27 % after some periods."""
     run = Trajectory.of(reference).at(np.arange(0, duration_s, step_s)[None])
     reached, allowed = largest(reference, Angles(*(part[0] for part in run))), bounds(reference)
     assert np.all(reached <= allowed)
@@ -56,11 +49,14 @@ def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step
         assert np.all(reached >= 0.999 * allowed)
 
 
-def test_the_extremes_of_a_random_reference_are_above_a_million_phases_and_near_the_largest() -> None:
-    """Frequencies that share no period, so that every combination of phases comes, some day."""
+@pytest.mark.parametrize("reference", [NEARLY_EQUAL, "random"])
+def test_the_extremes_are_above_a_million_phases_and_near_the_largest(reference: Sinusoid | str) -> None:
+    """Frequencies that share no short period, so that every combination of phases comes, some day."""
     rng = np.random.default_rng(0)
-    amplitude = tuple(rng.uniform((0, 0, 0), (80, 89, 300)).tolist())
-    reference = Sinusoid(amplitude=amplitude, frequency=tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist()))
+    if isinstance(reference, str):
+        amplitude = tuple(rng.uniform((0, 0, 0), (80, 89, 300)).tolist())
+        frequency = tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist())
+        reference = Sinusoid(amplitude=amplitude, frequency=frequency)
     allowed, reached = bounds(reference), np.zeros(9)
     for _ in range(10):
         phases = rng.uniform(0, 2 * pi, (100_000, 3))
