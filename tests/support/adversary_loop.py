@@ -54,37 +54,26 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
     }  # fmt: skip
 
 
-def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
-    """Constants of experiments, so many of each configuration."""
-    together = {name: np.array([one[name] for one in known], dtype=float) for name in known[0]}
-    return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
-
-
 def dot(a: Array, b: Array) -> Array:
-    product: Array = (a * b).sum(axis=-1, keepdims=True)
-    return product
+    return np.asarray((a * b).sum(axis=-1, keepdims=True))
 
 
 def norm(v: Array) -> Array:
-    length: Array = np.linalg.norm(v, axis=-1)
-    return length
+    return np.asarray(np.linalg.norm(v, axis=-1))
 
 
 def unit(v: Array) -> Array:
-    direction: Array = v / np.maximum(norm(v)[..., None], 1e-300)
-    return direction
+    return np.asarray(v / np.maximum(norm(v)[..., None], 1e-300))
 
 
 def by(matrix: Array, v: Array) -> Array:
-    product: Array = np.einsum("rij,rj->ri", matrix, v)
-    return product
+    return np.asarray(np.einsum("rij,rj->ri", matrix, v))
 
 
 def to_body(q: Array, v: Array) -> Array:
     """Rᵀ(q) v."""
     t = 2 * np.cross(q[..., 1:], v)
-    found: Array = v - q[..., :1] * t + np.cross(q[..., 1:], t)
-    return found
+    return np.asarray(v - q[..., :1] * t + np.cross(q[..., 1:], t))
 
 
 def times(p: Array, q: Array) -> Array:
@@ -139,14 +128,7 @@ def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
     passed, outward = (dot(moved, moved) - c.radius**2) / (outer**2 - c.radius**2), dot(moved, tau)
     along = c.Gamma * moved / np.maximum(dot(moved, c.Gamma * moved), 1e-300)
     moved = moved + c.T * (tau - (passed > 0) * (outward > 0) * np.minimum(passed, 1) * outward * along)
-    after: Array = c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300))
-    return after
-
-
-def rotor_lag(c: Any, V: Array, u: Array) -> Array:
-    """Each rotor's time constant now [s]."""
-    lag: Array = np.where((u - V) * V >= 0, c.up, c.down)
-    return lag
+    return np.asarray(c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300)))
 
 
 def held_axis(q: Array) -> Array:
@@ -167,7 +149,7 @@ class State(NamedTuple):
 
 def advance(c: Any, x: State, u: Array, theta: Array, push: Array) -> State:
     """Body and rotors after a period, by one Runge–Kutta step."""
-    half = np.exp(-c.T / 2 / np.maximum(rotor_lag(c, x.V, u), 1e-9))
+    half = np.exp(-c.T / 2 / np.maximum(np.where((u - x.V) * x.V >= 0, c.up, c.down), 1e-9))
     V = [u + (x.V - u) * (c.up > 0), u + (x.V - u) * half, u + (x.V - u) * half**2]
     torques = [push + by(c.B, each) for each in V]
 
@@ -283,7 +265,9 @@ def worst(known: list[dict[str, Any]], rows: int, generations: int, ticks: int) 
     Beside the constants, `start` is the largest ‖x(t₀)‖ and `case` the configuration's number. Shape (cases, 6).
     """
     rng, cases, total = np.random.default_rng(1), len(known), len(known) * rows
-    c = rows_of(known, rows)
+    c = SimpleNamespace(**{
+        name: np.repeat(np.array([one[name] for one in known], dtype=float), rows, axis=0) for name in known[0]
+    })  # fmt: skip
 
     # Ends at which the reference turns fastest about an axis, or changes that most, or anywhere; θ̃ against it.
     ends = rng.uniform(0, END_S, (300, total))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from math import degrees, hypot, inf, pi, radians, sqrt
 
@@ -74,10 +73,6 @@ def test_the_verdict_comes_first_the_exit_code_follows_it_and_json_has_every_equ
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     overrides = [word for change in [*FREE, *bits(12, 12)] for word in ("--set", change)]
-    assert run(("lab", "certify", *overrides)) == 0
-    shown = capfd.readouterr().out
-    assert shown.startswith("The certificate holds: once there, ‖z‖ stays ")
-    assert re.search(r"It still holds with \d+\.\d ms of further delay, or \d+ frames lost in a row\.", shown)
     assert run(("lab", "certify", *overrides, "--set", "wire.rate.limit=0.28")) == 1
     assert capfd.readouterr().out.startswith("The certificate does not hold: range: wire.rate.limit")
     assert run(("lab", "certify", "--json", *overrides)) == 0

@@ -15,10 +15,9 @@ import pytest
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion, sent_vector
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.reference import Floats, Trajectory, reference_function
+from aeroloop.service.control.reference import Floats, desired
 from aeroloop.service.theorem.bounds import (
     Samples,
     coordinates,
@@ -43,15 +42,10 @@ LAW = AdaptiveSettings(
 REFERENCE = Sinusoid(amplitude=(5.0, 30.0, 60.0), frequency=(0.5, 0.4, 0.3))
 COUNT = 1500
 DELTAS = {
-    "C.50": ["delta_omega_e"],
-    "C.51": ["delta_z2"],
-    "C.52": ["delta_z1"],
-    "C.53": ["delta_R"],
-    "C.54": ["delta_Psi1", "delta_Psi2"],
-    "C.55": ["delta_S1", "delta_S2"],
-    "C.56": ["delta_alpha1", "delta_alpha2"],
-    "C.57": ["delta_Phi"],
-}
+    "C.50": ["delta_omega_e"], "C.51": ["delta_z2"], "C.52": ["delta_z1"], "C.53": ["delta_R"],
+    "C.54": ["delta_Psi1", "delta_Psi2"], "C.55": ["delta_S1", "delta_S2"],
+    "C.56": ["delta_alpha1", "delta_alpha2"], "C.57": ["delta_Phi"],
+}  # fmt: skip
 LEMMA = tuple(DELTAS)
 
 
@@ -76,15 +70,8 @@ def turns(axis: Floats, angle: Floats) -> Floats:
 def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats]:
     """States along the reference, as far from it as was assumed, and what the law receives of them; and ω̇_d."""
     rng = np.random.default_rng(seed)
-    motion, desired = Compiled(reference_function()), Trajectory.of(REFERENCE)
-    rows = []
-    for name in ("amplitude", "frequency"):
-        motion.inputs[name][:] = memoryview(getattr(desired, name)[0].copy())
-    for t in rng.uniform(0, 60, COUNT):
-        motion.inputs["t"][0] = t
-        motion()
-        rows.append([value for name in ("q_d", "omega_d", "omega_d_dot") for value in motion.outputs[name]])
-    q_d, omega_d, omega_d_dot = np.split(np.array(rows), [4, 7], axis=1)
+    minute = desired(REFERENCE, 0.01, 6000)
+    q_d, omega_d, omega_d_dot = np.split(minute[rng.integers(0, 6000, COUNT)], [4, 7], axis=1)
     errors = turns(rng.standard_normal((COUNT, 3)), 2 * b.known.half_angle_e * rng.uniform(0, 1, COUNT))
     q = product(q_d, errors)
     omega = rng.uniform(-0.9, 0.9, (COUNT, 3))
