@@ -126,10 +126,20 @@ def wait_until_none_is_left(process: subprocess.Popen[str]) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
-def test_worker_processes_end_with_their_parent_in_silence(sent: int) -> None:
+@pytest.mark.parametrize(
+    ("words", "sent", "said"),
+    [
+        ("lab tables", signal.SIGINT, ""),
+        ("lab tables", signal.SIGKILL, ""),
+        ("demo --log a.mcap", signal.SIGINT, "aeroloop: 50 s of the experiment in real time, three processes\n"),
+    ],
+)
+def test_worker_processes_end_with_their_parent_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sent: int, said: str
+) -> None:
     """^C reaches the whole group; SIGKILL the parent alone."""
-    process = start(*COMMAND, "lab", "tables")
+    monkeypatch.chdir(tmp_path)
+    process = start(*COMMAND, *words.split())
     wait_for_workers(process)
     if sent == signal.SIGINT:
         os.killpg(process.pid, sent)
@@ -137,5 +147,5 @@ def test_worker_processes_end_with_their_parent_in_silence(sent: int) -> None:
         process.send_signal(sent)
     _, printed = process.communicate(timeout=PATIENCE_S)
     if sent == signal.SIGINT:
-        assert (process.returncode, printed) == (130, "")
+        assert (process.returncode, printed) == (130, said)
     wait_until_none_is_left(process)
