@@ -211,8 +211,7 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
     z = b.norm
 
     def Psi(omega: Floats, R: Floats) -> Floats:  # noqa: N802  # the paper's letter
-        Psi: Floats = -np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g))  # (C.43), (C.45)
-        return Psi
+        return np.asarray(-np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g)))  # (C.43), (C.45)
 
     alpha_dot, alpha_bar = (-x.sign[:, None] / 2 * C1 * times(c.A, c.omega_e) for c in (b, Q))  # (C.46)
     S_error = skew(x.omega) @ b.R - skew(x.omega_Q) @ Q.R
@@ -231,8 +230,7 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
         "C.57": ("‖Φ − Φ^Q‖", np.abs(x.omega_Q - x.omega).max(axis=1, keepdims=True), d.delta_Phi),  # (C.57)
     }
     return [
-        Inequality(number, what, norm(error), np.broadcast_to(right, z.shape))
-        for number, (what, error, right) in sides.items()
+        Inequality(n, what, norm(error), np.broadcast_to(most, z.shape)) for n, (what, error, most) in sides.items()
     ]
 
 
@@ -246,18 +244,14 @@ def skew(v: Floats) -> Floats:
 def rotation(q: Floats) -> Floats:
     """R(q) of (C.8) for each row: body to inertial. Shape (n, 3, 3)."""
     S = skew(q[:, 1:])
-    R: Floats = np.identity(3) + 2 * q[:, :1, None] * S + 2 * S @ S
-    return R
+    return np.asarray(np.identity(3) + 2 * q[:, :1, None] * S + 2 * S @ S)
 
 
 def times(matrices: Floats, vectors: Floats) -> Floats:
     """The matrix of each row times its vector, or times one common vector. Shape (n, 3)."""
-    product: Floats = np.einsum("nij,nj->ni", matrices, np.broadcast_to(vectors, matrices.shape[:2]))
-    return product
+    return np.asarray(np.einsum("nij,nj->ni", matrices, np.broadcast_to(vectors, matrices.shape[:2])))
 
 
 def norm(errors: Floats) -> Floats:
     """Length of each vector, or induced norm of each matrix. Shape (n,)."""
-    axes = tuple(range(1, errors.ndim))
-    lengths: Floats = np.linalg.norm(errors, 2, axis=axes if len(axes) > 1 else 1)
-    return lengths
+    return np.asarray(np.linalg.norm(errors, 2, axis=1 if errors.ndim == 2 else (1, 2)))

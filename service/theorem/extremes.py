@@ -67,10 +67,10 @@ def extremes(settings: Settings) -> Extremes:
             )
 
         def weighed(w: float) -> float:
-            def value(at: Angles) -> Floats:
-                return np.asarray(np.abs(vectors(at)).sum(axis=1) + w * np.linalg.norm(vectors(at), axis=1))
-
-            return trajectory.largest(value, half * [sqrt(3) + w, 1, 1, 1])
+            return trajectory.largest(
+                lambda at: np.linalg.norm(vectors(at), 1, axis=1) + w * np.linalg.norm(vectors(at), axis=1),
+                half * [sqrt(3) + w, 1, 1, 1],
+            )
 
         largest_sine = trajectory.largest(lambda at: np.linalg.norm(vectors(at), axis=1), half)
         found = Extremes(
