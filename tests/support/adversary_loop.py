@@ -1,7 +1,8 @@
 """A second closed loop in NumPy, of many configurations at once, whose errors an adversary chooses.
 
-It takes numbers from a configuration, and nothing else of the project: body (C.1), (C.2), free or with a held roll; the
-paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag; commands that are held, late or lost.
+It takes numbers from a configuration and the reference from the twin, and nothing else of the project: body (C.1),
+(C.2), free or with a held roll; the paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag;
+commands that are held, late or lost.
 
 At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the direction of τ_d and one of the commands that
 may be in force: each the one that pushes most along a costate of the linear error equations. Beside these it chooses θ,
@@ -22,14 +23,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
+from tests.support.numpy_twin import attitude_of, motion_of
+
 Array = npt.NDArray[np.float64]
-Motion = tuple[Array, ...]
-"""q_d, and ω_d and its derivative in the desired body frame."""
+Motion = tuple[Array, ...]  # q_d, and ω_d and its derivative in the desired body frame
 QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|")
 VERTICAL: Final = np.array([0.0, 0.0, 1.0])
 END_S: Final = 100 * 86_400.0
-_AT_ONCE: Final = 1e-3
-"""Lag of rotors in the costates of a body without any [s]."""
+_AT_ONCE: Final = 1e-3  # lag of rotors in the costates of a body without any [s]
 
 
 def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:
@@ -54,12 +55,22 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
     }  # fmt: skip
 
 
+def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
+    together = {name: np.array([one[name] for one in known], dtype=float) for name in known[0]}
+    return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
+
+
+def cross(a: Array, b: Array) -> Array:
+    (x, y, z), (u, v, w) = ((each[..., 0], each[..., 1], each[..., 2]) for each in (a, b))
+    return np.asarray(np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1))
+
+
 def dot(a: Array, b: Array) -> Array:
     return np.asarray((a * b).sum(axis=-1, keepdims=True))
 
 
 def norm(v: Array) -> Array:
-    return np.asarray(np.linalg.norm(v, axis=-1))
+    return np.asarray(np.sqrt((v * v).sum(axis=-1)))
 
 
 def unit(v: Array) -> Array:
@@ -71,33 +82,19 @@ def by(matrix: Array, v: Array) -> Array:
 
 
 def to_body(q: Array, v: Array) -> Array:
-    """Rᵀ(q) v."""
-    t = 2 * np.cross(q[..., 1:], v)
-    return np.asarray(v - q[..., :1] * t + np.cross(q[..., 1:], t))
+    t = 2 * cross(q[..., 1:], v)
+    return np.asarray(v - q[..., :1] * t + cross(q[..., 1:], t))
 
 
 def times(p: Array, q: Array) -> Array:
-    """p ∘ q."""
     (a, b), (s, v) = (p[..., :1], p[..., 1:]), (q[..., :1], q[..., 1:])
-    return np.concatenate([a * s - dot(b, v), a * v + s * b + np.cross(b, v)], axis=-1)
-
-
-def attitude_of(angle: Array) -> Array:
-    """q of roll, pitch and yaw, of which yaw turns first."""
-    (a, b, c), (r, p, y) = np.cos(angle / 2).T, np.sin(angle / 2).T
-    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
+    return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
 
 
 def desired(c: Any, t: Array) -> Motion:
-    """The reference at times t, one a row."""
     turn = c.frequency * t[:, None]
     angle, rate = c.amplitude * np.sin(turn), c.amplitude * c.frequency * np.cos(turn)
-    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = angle.T, rate.T, (-(c.frequency**2) * angle).T
-    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
-    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
-    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=1)
-    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[:, 2], across_dot * cr - ddp * sr - dr * omega[:, 1]
-    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=1)
+    return motion_of(angle, rate, -(c.frequency**2) * angle)
 
 
 def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
@@ -108,17 +105,16 @@ def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
 
 
 def drift(c: Any, q: Array, omega: Array) -> Array:
-    """Ψ: what the body turns by without command and damping."""
-    return np.cross(c.r_g, to_body(q, c.weight)) - np.cross(omega, c.J * omega)
+    return cross(c.r_g, to_body(q, c.weight)) - cross(omega, c.J * omega)
 
 
 def torque_of(c: Any, q: Array, omega: Array, now: Motion, theta: Array, integral: Array) -> tuple[Array, ...]:
     """B u, z₂ and the integral's rate: C₁ = C₂ = 0 leave PD and PID, k_d = k_i = 0 the paper's law."""
     eta_e, eps_e, omega_e, omega_d, omega_d_dot = errors(q, omega, now)
     z2 = omega_e + c.C1 * eps_e
-    alpha_dot = -c.C1 / 2 * (eta_e * omega_e + np.cross(eps_e, omega_e))
+    alpha_dot = -c.C1 / 2 * (eta_e * omega_e + cross(eps_e, omega_e))
     feedback = -c.kp * eps_e - c.C2 * z2 - c.kd * omega_e - c.ki * integral
-    ahead = omega * theta - drift(c, q, omega) - c.J * (np.cross(omega, omega_d) - omega_d_dot - alpha_dot)
+    ahead = omega * theta - drift(c, q, omega) - c.J * (cross(omega, omega_d) - omega_d_dot - alpha_dot)
     return feedback + ahead, z2, omega_e + c.share * eps_e
 
 
@@ -129,6 +125,10 @@ def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
     along = c.Gamma * moved / np.maximum(dot(moved, c.Gamma * moved), 1e-300)
     moved = moved + c.T * (tau - (passed > 0) * (outward > 0) * np.minimum(passed, 1) * outward * along)
     return np.asarray(c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300)))
+
+
+def rotor_lag(c: Any, V: Array, u: Array) -> Array:
+    return np.asarray(np.where((u - V) * V >= 0, c.up, c.down))
 
 
 def held_axis(q: Array) -> Array:
@@ -149,12 +149,12 @@ class State(NamedTuple):
 
 def advance(c: Any, x: State, u: Array, theta: Array, push: Array) -> State:
     """Body and rotors after a period, by one Runge–Kutta step."""
-    half = np.exp(-c.T / 2 / np.maximum(np.where((u - x.V) * x.V >= 0, c.up, c.down), 1e-9))
+    half = np.exp(-c.T / 2 / np.maximum(rotor_lag(c, x.V, u), 1e-9))
     V = [u + (x.V - u) * (c.up > 0), u + (x.V - u) * half, u + (x.V - u) * half**2]
     torques = [push + by(c.B, each) for each in V]
 
     def slope(q: Array, omega: Array, torque: Array) -> tuple[Array, Array]:
-        q_dot = np.concatenate([-dot(q[:, 1:], omega), q[:, :1] * omega + np.cross(q[:, 1:], omega)], axis=1) / 2
+        q_dot = np.concatenate([-dot(q[:, 1:], omega), q[:, :1] * omega + cross(q[:, 1:], omega)], axis=1) / 2
         omega_dot = (drift(c, q, omega) - theta * omega + torque) / c.J
         n = held_axis(q)  # along it a mechanism's torque keeps n·ω = 0
         n_dot = omega[:, 1:2] * np.stack([-n[:, 2], n[:, 1], n[:, 0]], axis=1)
@@ -265,9 +265,7 @@ def worst(known: list[dict[str, Any]], rows: int, generations: int, ticks: int) 
     Beside the constants, `start` is the largest ‖x(t₀)‖ and `case` the configuration's number. Shape (cases, 6).
     """
     rng, cases, total = np.random.default_rng(1), len(known), len(known) * rows
-    c = SimpleNamespace(**{
-        name: np.repeat(np.array([one[name] for one in known], dtype=float), rows, axis=0) for name in known[0]
-    })  # fmt: skip
+    c = rows_of(known, rows)
 
     # Ends at which the reference turns fastest about an axis, or changes that most, or anywhere; θ̃ against it.
     ends = rng.uniform(0, END_S, (300, total))
