@@ -37,10 +37,8 @@ WIND: Final = {
     "quantized_8_6": {"calm": {"z_track_1e-4": 49, "u_total": 8042}, "wind": {"z_track_1e-4": 119, "u_total": 9699}},
 }
 """Table C.4."""
-DURATION_S: Final = 50.0
-"""Length of every experiment [s]."""
-CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
-"""Bits out and in of Table C.4."""
+DURATION_S: Final = 50.0  # of every experiment
+CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}  # bits out and in of Table C.4
 _FIGURES: Final = ("z_track_1e-4", "u_total")
 
 # ── one cell ──
