@@ -58,11 +58,11 @@ class BodySettings(BaseModel, extra="forbid"):
 
 
 class AeroSettings(BodySettings):
-    """The Aero's body. Defaults: Table C.1 of the paper, except the centre of mass, fitted by `lab calibrate`."""
+    """The Aero's body. Defaults: Table C.1 of the paper, except the centre of mass, fitted to the paper."""
 
     centre_of_mass: Vector = Field(
         default=(0.0, 0.0, -0.003951),
-        description="r_g, pivot to centre of mass, body frame [m]; height by `lab calibrate`, Table C.1: -0.0038",
+        description="r_g, pivot to centre of mass, body frame [m]; height fitted to the paper, Table C.1: -0.0038",
     )
     thrust: tuple[tuple[float, float], tuple[float, float]] = Field(
         default=((0.0011, 0.0011), (-0.0014, 0.00176)), description="pitch and yaw rows of B, columns u2 and u3 [N·m/V]"

@@ -69,7 +69,7 @@ class FrictionSettings(BaseModel, extra="forbid"):
     coulomb: tuple[float, ...] = Field(
         default=(0.0009, 0.003040),
         max_length=3,
-        description="Coulomb friction about the axes [N·m]; pitch measured (spin-down), yaw fitted by `lab calibrate`",
+        description="Coulomb friction about the axes [N·m]; pitch measured (spin-down), yaw fitted to the paper",
     )
     width: float = Field(default=0.01, gt=0, le=1, description="rate within which Coulomb torque changes sign [rad/s]")
 
@@ -94,7 +94,7 @@ class WindSettings(BaseModel, extra="forbid"):
     torque: tuple[float, ...] = Field(
         default=(-0.000220, 0.009858),
         max_length=3,
-        description="steady torque about the axes [N·m], missing ones 0; fitted by `lab calibrate`",
+        description="steady torque about the axes [N·m], missing ones 0; fitted to the paper",
     )
     gust: float = Field(
         default=0.2,

@@ -73,16 +73,6 @@ def tables(
     show(result, json, sheets, markdown)
 
 
-def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Fit the plant to two of the paper's cells, calm and windy."""
-    settings = loop_of(config, overrides)
-    from aeroloop.service.lab.tables import calibrate, calibration_sheets
-
-    with working("experiments", json) as update:
-        result = calibrate(settings, update)
-    show(result, json, calibration_sheets)
-
-
 def certify(
     disturbance: Annotated[
         float | None,
@@ -286,5 +276,5 @@ def design(
 
 
 group = typer.Typer()
-for verb in (experiment, tables, calibrate, certify, burden, laws, sweep, tune, design):
+for verb in (experiment, tables, certify, burden, laws, sweep, tune, design):
     group.command()(verb)

@@ -52,8 +52,7 @@ class Configuration(NamedTuple):
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
     """Axes of `section.key=a,b,c` or `section.key=a..b*n`, n values evenly from a to b; `section.key*=` has factors.
 
-    Raises:
-        ConfigError: Neither of them, no value, or a key that stands twice or that no experiment depends on.
+    Raises ConfigError for neither of them, no value, or a key that stands twice or that no experiment depends on.
     """
     axes = dict[str, Axis]()
     for axis in map(_axis, texts):
@@ -97,8 +96,7 @@ def _spread(part: str, text: str) -> list[str]:
 def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duration_s: float) -> list[Configuration]:
     """Every combination of the axes' values, the last axis fastest.
 
-    Raises:
-        ConfigError: One is no configuration, two are the same, or they are too many.
+    Raises ConfigError if one is no configuration, two are the same, or they are too many.
     """
     total = prod(len(axis.values) for axis in axes) * seeds
     if total > LIMIT:

@@ -37,23 +37,15 @@ QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
 """Kinds for ε, ω and u, by the name of the choice."""
 FLOAT64: Final = SignalBits(None, None, None)
 SENSORS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
-    "perfect": (
-        "the true attitude and rate, so that only quantizers come between the body and the law",
-        {"attitude": "perfect", "rate": "perfect"},
-    ),
-    "encoders": (
-        "encoders and their filtered derivative, as on the paper's bench",
-        {"attitude": "encoders", "rate": "derivative"},
-    ),
-    "gyro": (
-        "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of the 8-bit step",
-        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002},
-    ),
-    "shaken-gyro": (
-        "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps of 8 bits",
-        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
-    ),
-}
+    "perfect": ("the true attitude and rate, so that only quantizers come between the body and the law",
+                {"attitude": "perfect", "rate": "perfect"}),
+    "encoders": ("encoders and their filtered derivative, as on the paper's bench",
+                 {"attitude": "encoders", "rate": "derivative"}),
+    "gyro": ("encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of the 8-bit step",
+             {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002}),
+    "shaken-gyro": ("encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps of 8 bits",
+                    {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02}),
+}  # fmt: skip
 """What they are, and fields of `plant.sensors`; others stay as configured. A body without joints has no encoders."""
 
 
@@ -72,13 +64,8 @@ class BurdenCell(NamedTuple):
 def grid(settings: Settings, bits: Sequence[str] = (), quantizers: Sequence[str] = ()) -> dict[BurdenCell, Settings]:
     """The configuration of every cell, under all sensors that the plant can have, float64 always among them.
 
-    Args:
-        settings: The configuration.
-        bits: Such as 8/6 or 10/6/6; `cont` for float64; all of `BITS` if none.
-        quantizers: Names out of `QUANTIZERS`; all if none.
-
-    Raises:
-        GridError: An unknown name, or a cell that the configuration does not allow.
+    `bits` are such as 8/6 or 10/6/6, `cont` for float64, all of `BITS` if none; `quantizers` names out of `QUANTIZERS`,
+    all if none. Raises GridError for an unknown name, or a cell that the configuration does not allow.
     """
     try:
         pairs = dict.fromkeys(map(SignalBits.parse, bits or BITS))
@@ -141,17 +128,9 @@ def measure_burden(
     progress: Progress = lambda _done, _total: None,
     engine: str = PROCESSES,
 ) -> Burden:
-    """Run a grid on every worker.
+    """Run a grid, as of `grid`, by an engine as of `open_workers`.
 
-    Args:
-        settings: The configuration.
-        cells: As of `grid`.
-        duration_s: Length of each experiment [s].
-        progress: Called with experiments done and experiments in all.
-        engine: As of `open_workers`.
-
-    Raises:
-        GridError: The loop trips with float64, or float64 has no error to compare with.
+    Raises GridError if the loop trips with float64, or float64 has no error to compare with.
     """
     runs, work = list(map(run_of, cells.values())), partial(figures_row, duration_s=duration_s)
     with open_workers(engine) as workers:
@@ -167,15 +146,9 @@ def measure_burden(
 def _point(chosen: BurdenCell, settings: Settings, row: Row) -> Row:
     has_figures, wire = row["reason"] is None, settings.wire
     always = (wire.measurement.size + wire.command.size) * 8 * settings.loop.rate_hz
-    return {
-        **chosen._asdict(),
-        "bits": str(chosen.bits),
-        **row,
-        "every_tick_bits_per_s": always,
-        "bits_per_s": row["measurement_bits_per_s"] + row["command_bits_per_s"] if has_figures else None,
-        "against_float64": None,
-        "pareto": False,
-    }
+    sent = row["measurement_bits_per_s"] + row["command_bits_per_s"] if has_figures else None
+    figures = {**row, "every_tick_bits_per_s": always, "bits_per_s": sent}
+    return {**chosen._asdict(), "bits": str(chosen.bits), **figures, "against_float64": None, "pareto": False}
 
 
 def _compare(points: Sequence[Row], sensors: str) -> None:

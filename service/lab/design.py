@@ -7,22 +7,23 @@ same levels travel in fewer frames, so the bound stands: the front has what that
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import product, starmap
-from math import asin, degrees
+from math import inf
 from typing import Final
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import SignalBits, WireSpec
 from aeroloop.service.config import Settings
-from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, figures_row, open_workers, run_of
-from aeroloop.service.theorem.certificate import beyond, premises
+from aeroloop.service.lab.engine import PROCESSES, Progress, Sheets, cell, figures_row, open_workers, run_of
+from aeroloop.service.theorem.certificate import beyond
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.invariant import reach
-from aeroloop.service.theorem.plant_bounds import paper_body
+from aeroloop.service.theorem.premises import PlantBounds, premises
 
 BITS: Final = range(4, 15)
 """Of each signal."""
@@ -34,8 +35,6 @@ class DesignError(AeroloopError):
 
 class Point(BaseModel):
     """One design: bits and rate, what is proven of it, and what experiments show."""
-
-    model_config = ConfigDict(frozen=True)
 
     kbit_s: float = Field(description="payload of both frames at every tick, padding included [kbit/s]")
     rate_hz: float
@@ -87,18 +86,30 @@ def design(
         progress: Called with experiments done and in all.
         engine: As of `open_workers`.
 
-    Raises:
-        DesignError: No design is within the error.
-        NoTheoremError: Nothing is proven of the law.
-        BoundlessError: The reference has no bounds.
+    Raises DesignError if no design is within the error, NoTheoremError and BoundlessError as `certify` does.
     """
     found, tried = list[Point](), 0
     for rate in rates or [settings.loop.rate_hz]:
-        loop = settings.loop.model_copy(update={"rate_hz": rate})
-        points = _points(settings.model_copy(update={"loop": loop}), delay_s + lost * loop.period, kbit)
-        tried += len(points)
-        found += [point for point in points if point is not None and point.degrees <= error_deg]
-    front = list(_front(found))
+        base = settings.model_copy(update={"loop": settings.loop.model_copy(update={"rate_hz": rate})})
+        desired, period = extremes(base), base.loop.period
+        for bits, size in _splits(base.wire):
+            payload = size * 8 / period / 1e3
+            if kbit is not None and payload > kbit:
+                continue
+            tried += 1
+            split = base.model_copy(update={"wire": base.wire.with_bits(str(bits))})
+            p = premises(split, desired, PlantBounds(period), 0.0, delay_s + lost * period)
+            if (at := reach(p)) is not None and at.degrees <= error_deg:
+                ranges = [name for *_, name in beyond(split, p, at)]
+                found.append(
+                    Point(
+                        kbit_s=round(payload, 3), rate_hz=rate, bits=str(bits), radius=at.radius, degrees=at.degrees,
+                        beyond=ranges,
+                    )
+                )  # fmt: skip
+    found.sort(key=lambda point: (point.kbit_s, point.radius))
+    least = np.minimum.accumulate([inf, *(point.radius for point in found)])
+    front = [point for point, before in zip(found, least, strict=False) if point.radius < before]
     if not front:
         raise DesignError(
             f"no design of {tried} is proven to stay within {error_deg:g}°"
@@ -108,32 +119,12 @@ def design(
     runs = [run_of(settings, [*point.overrides(), each]) for point in front for each in sent]
     with open_workers(engine) as workers:
         rows = workers.rows(partial(figures_row, duration_s=duration_s), runs, lambda n: progress(n, len(runs)))
-    simulated = zip(front, rows[::2], rows[1::2], strict=True)
-    return Design(tried=tried, front=[_with_figures(*each) for each in simulated])
-
-
-def _points(base: Settings, late_s: float, kbit: float | None) -> list[Point | None]:
-    """Every split of full frames at this rate; None where nothing is proven."""
-    desired, bounds, found = extremes(base), paper_body(base), list[Point | None]()
-    for bits, size in _splits(base.wire):
-        payload = size * 8 / base.loop.period / 1e3
-        if kbit is not None and payload > kbit:
-            continue
-        split = base.model_copy(update={"wire": base.wire.with_bits(str(bits))})
-        p = premises(split, desired, bounds, 0.0, late_s)
-        at = reach(p)
-        point = None
-        if at is not None:
-            point = Point(
-                kbit_s=round(payload, 3),
-                rate_hz=base.loop.rate_hz,
-                bits=str(bits),
-                radius=at.radius,
-                degrees=degrees(2 * asin(at.eps_e)),
-                beyond=[name for *_, name in beyond(split, p, at)],
-            )
-        found.append(point)
-    return found
+    for point, every_tick, on_change in zip(front, rows[::2], rows[1::2], strict=True):
+        point.z_track, point.reason = every_tick["z_track"], every_tick["reason"]
+        if on_change["reason"] is None:
+            sent = on_change["measurement_bits_per_s"] + on_change["command_bits_per_s"]
+            point.on_change_kbit_s = round(sent / 1e3, 3)
+    return Design(tried=tried, front=front)
 
 
 @lru_cache(maxsize=8)
@@ -148,22 +139,6 @@ def _splits(wire: WireSpec) -> list[tuple[SignalBits, int]]:
         for bits, size in sizes.items()
         if all(sizes.get(bits._replace(**{name: each + 1})) != size for name, each in bits._asdict().items())
     ]
-
-
-def _front(points: Sequence[Point]) -> Iterator[Point]:
-    """The points that no other beats at less payload, the least payload first."""
-    least = float("inf")
-    for point in sorted(points, key=lambda one: (one.kbit_s, one.radius)):
-        if point.radius < least:
-            least = point.radius
-            yield point
-
-
-def _with_figures(point: Point, every_tick: Row, on_change: Row) -> Point:
-    sent = [on_change[f"{name}_bits_per_s"] for name in ("measurement", "command")]
-    kbit_s = None if None in sent else round(sum(sent) / 1e3, 3)
-    figures = {name: every_tick[name] for name in ("z_track", "reason")}
-    return point.model_copy(update={**figures, "on_change_kbit_s": kbit_s})
 
 
 def sheets(found: Design) -> Sheets:

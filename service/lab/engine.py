@@ -14,15 +14,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from hashlib import sha256
@@ -116,20 +109,15 @@ class Workers(NamedTuple):
     def stream(self, work: Callable[[Settings], Result], runs: Sequence[Run]) -> Iterator[tuple[int, Result]]:
         """Number and result of each run, as they finish.
 
-        Args:
-            work: Function at the top level of a module, or a `partial` of one.
-            runs: Configurations.
-
-        Raises:
-            SweepError: A worker ended, or has another version of aeroloop, or Dask's scheduler is gone.
-            Exception: The first exception that the function raised.
+        `work` is a function at the top level of a module, or a `partial` of one; its first exception is raised. Raises
+        SweepError if a worker ended, or has another version of aeroloop, or Dask's scheduler is gone.
         """
         pending, sent = dict[Future[Result], int](), 0
         while pending or sent < len(runs):
             while sent < len(runs) and len(pending) < 2 * self.cores:  # none waits for its next, few are in memory
                 pending[self.executor.submit(_done, code_version(), work, runs[sent])] = sent
                 sent += 1
-            for future in wait(pending, return_when=FIRST_COMPLETED).done:
+            for future in futures.wait(pending, return_when=futures.FIRST_COMPLETED).done:
                 yield pending.pop(future), _result_of(future)
 
     def rows(
@@ -146,9 +134,9 @@ class Workers(NamedTuple):
 def _result_of(future: Future[Result]) -> Result:
     try:
         return future.result()
-    except BrokenExecutor:
+    except futures.BrokenExecutor:
         raise SweepError("a worker process ended in the middle of an experiment: killed, or no memory") from None
-    except CancelledError:
+    except futures.CancelledError:
         raise SweepError("the Dask scheduler is gone, or has dropped the experiments") from None
     except Exception as error:
         if type(error).__module__.startswith("distributed"):  # such as KilledWorker, after several workers
@@ -164,11 +152,9 @@ def check_engine(engine: str) -> None:
 
 @contextmanager
 def open_workers(engine: str = PROCESSES) -> Iterator[Workers]:
-    """Workers of an engine, ended with the context.
+    """Workers of an engine, `processes` or `dask:ADDRESS`, ended with the context.
 
-    Raises:
-        SweepError: No such engine, or no scheduler or worker answers.
-        ModuleNotFoundError: Dask is not installed.
+    Raises SweepError if there is no such engine, scheduler or worker, ModuleNotFoundError if Dask is not installed.
     """
     check_engine(engine)
     with local_processes() if engine == PROCESSES else _dask(engine.removeprefix(_DASK)) as workers:
@@ -189,7 +175,7 @@ def local_processes() -> Iterator[Workers]:
     first = context.Process(target=int)  # waits for the server's imports: ^C must not meet a worker that starts
     first.start()
     first.join()
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as executor:
+    with futures.ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as executor:
         try:
             yield Workers(executor, count)
         except BaseException:  # a failure or ^C: what the others compute has no use

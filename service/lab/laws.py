@@ -26,7 +26,7 @@ from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, 
 from aeroloop.service.lab.margins import LONGEST_S, WITHIN_DEG, survived
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import BoundlessError
-from aeroloop.service.theorem.feedback import NoTheoremError
+from aeroloop.service.theorem.premises import NoTheoremError
 
 # ── what is compared ──
 
@@ -116,18 +116,9 @@ def compare(
     engine: str = PROCESSES,
     progress: Progress = lambda _done, _total: None,
 ) -> Laws:
-    """Run laws on every worker.
+    """Run laws, as of `compared_laws`, each calm and in wind with so many seeds, by an engine as of `open_workers`.
 
-    Args:
-        settings: The configuration; each law has its own settings, and wind blows or does not.
-        laws: Names and overrides, as of `compared_laws`.
-        seeds: Runs of each law, calm and in wind, with seeds from 0 up.
-        duration_s: Length of an experiment [s].
-        engine: As of `open_workers`.
-        progress: Called with experiments and searches done, and in all.
-
-    Raises:
-        SweepError: As of `open_workers` and `Workers.stream`.
+    Where the plant is not emulated, a law runs in its own wind alone.
     """
     winds: dict[str, list[str]] = {"its own": []}
     if settings.plant.emulated:
@@ -141,23 +132,18 @@ def compare(
         survive = partial(survived, duration_s=duration_s)
         margins = workers.rows(survive, searches, lambda n: progress(len(runs) + n, total))
     configured = {name: with_law_settings(load_over(settings, overrides)) for name, overrides in laws.items()}
-    of_law = {
-        name: {"pointwise_deg": _proven(configured[name]), **margin} for name, margin in zip(laws, margins, strict=True)
-    }
+    of_law = {n: {"pointwise_deg": _proven(configured[n]), **margin} for n, margin in zip(laws, margins, strict=True)}
     response, wire = _response(settings), settings.wire
+    bits = SignalBits(wire.attitude.bits, wire.rate.bits, wire.voltage.bits)
     return Laws(
-        duration_s=duration_s,
-        seeds=seeds,
-        bits=str(SignalBits(wire.attitude.bits, wire.rate.bits, wire.voltage.bits)),
-        bandwidth=list(response.bandwidth),
-        damping_ratio=list(response.damping),
-        margin_duration_s=min(duration_s, LONGEST_S),
+        duration_s=duration_s, seeds=seeds, bits=str(bits), margin_duration_s=min(duration_s, LONGEST_S),
+        bandwidth=list(response.bandwidth), damping_ratio=list(response.damping),
         gains={name: each.description()["law"] for name, each in configured.items()},
         rows=[
             {"law": name, "wind": wind, **of_law[name], **_over_seeds(rows[i * seeds : (i + 1) * seeds])}
             for i, (name, wind) in enumerate(choices)
         ],
-    )
+    )  # fmt: skip
 
 
 def _proven(settings: Settings) -> float | None:

@@ -80,22 +80,18 @@ class Loop:
         self._mechanism = mechanism = plant.mechanism()
         self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period)
-        held = {
-            "measured": 6,
-            "commanded": wire.actuators,
-            "numbers": 3 * len(NUMBERS),
-            "zeros": 2,
-            "gains": len(law.gains),
-        }
-        sizes = {"x": step.numel_in("x"), "last": 4, "law": len(law.state), "seen": 7, "filters": 4, **held}
+        sizes = {
+            "x": step.numel_in("x"), "last": 4, "law": len(law.state), "seen": 7, "filters": 4, "measured": 6,
+            "commanded": wire.actuators, "numbers": 3 * len(NUMBERS), "zeros": 2, "gains": len(law.gains),
+        }  # fmt: skip
         self._still = [0.0] * (sizes["x"] - len(mechanism.initial))
         functions = law.function, step, sensor_function(plant.sensors, period)
         with as_written():
             self.tick = self._tick(settings, sizes, functions)
         self.in_c = self._tried_c = False
         self._ticks = 0
-        self._map(self.tick)
         self._desired: tuple[object, Floats] = None, np.empty(0)
+        self._map(self.tick)
 
     def _tick(
         self, settings: Settings, sizes: dict[str, int], functions: tuple[ca.Function, ca.Function, ca.Function]
@@ -189,15 +185,9 @@ class Loop:
             torque[:] = [next(wind) for _ in range(ticks)]
         if plant.sensors.rate == "gyro":
             error[:] = [next(sensors.errors) for _ in range(ticks)]
-        return {"state": state, "desired": self._wanted(settings, ticks), "wind": torque, "error": error}
-
-    def _wanted(self, settings: Settings, ticks: int) -> Floats:
-        """The desired motion; the last one is kept, as the cells of a table share it."""
-        key = settings.reference, ticks
-        if self._desired[0] != key:
-            rows = desired(settings.reference, settings.loop.period, ticks)
-            self._desired = key, np.ascontiguousarray(rows)
-        return self._desired[1]
+        if self._desired[0] != (key := (settings.reference, ticks)):  # the cells of a table share it
+            self._desired = key, np.ascontiguousarray(desired(settings.reference, period, ticks))
+        return {"state": state, "desired": self._desired[1], "wind": torque, "error": error}
 
 
 def _normal(settings: Settings, voltages: Floats, u: Floats, seen: Floats) -> bool:
@@ -270,12 +260,9 @@ def in_c(function: ca.Function) -> ca.Function | None:
         with TemporaryDirectory(prefix="aeroloop-") as folder:  # what is loaded stays, without its file
             source = Path(folder, generator.generate(f"{folder}/"))
             options: dict[str, Any] = {
-                "compiler": compiler,
-                "linker": compiler,
-                "compiler_flags": ("-O1", "-ffp-contract=off"),
-                "directory": f"{folder}/",
-                "cleanup": False,  # the folder goes as a whole
-            }
+                "compiler": compiler, "linker": compiler, "compiler_flags": ("-O1", "-ffp-contract=off"),
+                "directory": f"{folder}/", "cleanup": False,  # the folder goes as a whole
+            }  # fmt: skip
             return ca.external(function.name(), ca.Importer(str(source), "shell", options))
     except (OSError, RuntimeError):  # no place for files, or no library came of it
         return None

@@ -147,15 +147,8 @@ def run_sweep(
 ) -> Sweep:
     """Run what is missing in the file of rows beside a table, and write the table, in place of an older one.
 
-    Args:
-        plan: What to run.
-        out: The table, a Parquet or CSV file.
-        engine: As of `open_workers`.
-        progress: Called with experiments done, those found included, and experiments in all.
-
-    Raises:
-        SweepError: The file of rows cannot be used, or workers fail.
-        OutputError: The table cannot be written.
+    Experiments found count as done in `progress`. Raises SweepError if the file of rows cannot be used or workers fail,
+    OutputError if the table, a Parquet or CSV file, cannot be written.
     """
     began, config = time.monotonic(), json.dumps(plan.settings.description())
     each = [(configuration, seed) for configuration in plan.configurations for seed in range(plan.seeds)]
@@ -172,18 +165,12 @@ def run_sweep(
                     progress(done, len(keys))
         rows = [file.rows[key] for key in keys]
     _write_table(out, plan, keys, rows)
+    failed = sum(row["reason"] is not None for row in rows)
     return Sweep(
-        experiments=len(rows),
-        configurations=len(plan.configurations),
-        done=len(missing),
-        resumed=resumed,
-        failed=sum(row["reason"] is not None for row in rows),
-        out=str(out),
-        rows=str(rows_file(out)),
-        version=code_version(),
-        engine=engine,
+        experiments=len(rows), configurations=len(plan.configurations), done=len(missing), resumed=resumed,
+        failed=failed, out=str(out), rows=str(rows_file(out)), version=code_version(), engine=engine,
         seconds=time.monotonic() - began,
-    )
+    )  # fmt: skip
 
 
 def _write_table(out: Path, plan: SweepPlan, keys: Sequence[Key], rows: Sequence[Row]) -> None:
@@ -204,13 +191,8 @@ def _write_table(out: Path, plan: SweepPlan, keys: Sequence[Key], rows: Sequence
     columns |= {name: pa.array([getattr(key, name) for key in keys]) for name in ("configuration", "version")}
     described = {name: field.description or "" for name, field in Figures.model_fields.items()}
     facts = {"config": plan.settings.description(), "duration_s": plan.duration_s}
-    schema = pa.schema(
-        [
-            pa.field(name, each.type, metadata={"description": described.get(name, "")})
-            for name, each in columns.items()
-        ],
-        {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()},
-    )
+    fields = [pa.field(n, each.type, metadata={"description": described.get(n, "")}) for n, each in columns.items()]
+    schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
     table = pa.Table.from_arrays(list(columns.values()), schema=schema)
     with writing(out, force=True) as part:
         if out.suffix == ".csv":

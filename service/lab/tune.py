@@ -133,15 +133,8 @@ def tune(
 ) -> Tuning:
     """Search gains. ^C ends the search, not this: what whole generations have found so far is the result.
 
-    Args:
-        settings: The configuration, with the law's own settings.
-        options: What to search.
-        workers: Where experiments run.
-        progress: Called with experiments of the search done, and in all, at most.
-
-    Raises:
-        TuneError: There is nothing to search, or every candidate trips.
-        ModuleNotFoundError: SciPy is not installed.
+    `progress` is called with experiments of the search done, and in all, at most. Raises TuneError if there is nothing
+    to search or every candidate trips, ModuleNotFoundError without SciPy.
     """
     from scipy.optimize import differential_evolution  # an extra, and slow to import
 
@@ -190,18 +183,12 @@ def tune(
         {"gains": gains, "training": trained, "held_out": unseen, **margin}
         for gains, trained, unseen, margin in zip((configured, best), (before, after), held, margins, strict=True)
     ]
+    changed = {f"law.{name}": gain for name, gain in best.items() if gain != configured[name]}
     return Tuning(
-        law=settings.law.kind,
-        duration_s=options.duration_s,
-        training=training,
-        held_out=held_out,
-        before=sides[0],
-        after=sides[1],
-        overrides=as_overrides({f"law.{name}": gain for name, gain in best.items() if gain != configured[name]}),
-        candidates=len(tried),
-        interrupted=interrupted,
-        worse=bool(held_out) and rank(held[1], inf) > rank(held[0], inf),
-    )
+        law=settings.law.kind, duration_s=options.duration_s, training=training, held_out=held_out,
+        before=sides[0], after=sides[1], overrides=as_overrides(changed), candidates=len(tried),
+        interrupted=interrupted, worse=bool(held_out) and rank(held[1], inf) > rank(held[0], inf),
+    )  # fmt: skip
 
 
 def _refusal(settings: Settings, gains: Gains) -> str | None:

@@ -26,7 +26,8 @@ from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem import bounds as lemma
 from aeroloop.service.theorem.certificate import promise
-from aeroloop.service.theorem.invariant import Premises, distance, reach
+from aeroloop.service.theorem.invariant import distance, reach
+from aeroloop.service.theorem.premises import Premises
 
 
 class TheoremCheck(NamedTuple):

@@ -1,30 +1,15 @@
 """Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper, and both sides of each at given states.
 
 `Known`, `Lemma` and `Theorem` hold each quantity's symbol, equation, unit and meaning; a certificate prints them. The
-paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here. The paper's text is read
-as follows where it cannot be evaluated as printed:
-
-- (C.50), (C.51) and (C.58), (C.59) compare vectors with ≤; they are read with norms. The δ_ωe of (C.58) is then
-  δ_R k_ωd + δ_ω, with the k_ε² of (C.61).
-- The paper states of k_ε of (C.31) only that it exceeds 1. Here it is the least constant that bounds d_ε, the chord
-  ‖q^Q − q‖ and d_ε̃ of (C.33): near η = 0, ε determines η badly, so k_ε follows from the largest angle of the body.
-- c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
-  λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
-- (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
-- Remark 5 says ‖θ̃‖ ≤ k_θ. Here k_θ is the radius of a ball around θ̂(t₀), which Assumption 2 allows as any convex set;
-  θ is within it, and the projection keeps θ̂ within k_θ/0.95 of its centre: their sum bounds θ̃.
-- k of (C.66) is the largest allowed: the margin itself.
-- (C.26) has k_ω_e = 1 + λ_max(C₁); ω_e = z₂ − C₁ε̃ gives √(1 + λ_max(C₁)²). (C.56) has λ_max(C₁) k_ω_e; since e ↦ η̃ I
-  + S(ε̃) is linear and of norm ‖e‖, the difference is ½ λ_max(C₁) δ_q k_ω_e, which vanishes without quantization.
-- (C.68) does not follow: V of (C.24), (C.73) contains θ̃, so the ball is no level set of V. What (C.77) proves is the
-  mean square, (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, in continuous time. `invariant` has a bound at every instant.
+paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here. README.md says how the
+paper is read where it cannot be evaluated as printed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import cos, pi, sin, sqrt
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +18,13 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Floats
 
 
-class Term(NamedTuple):
-    """A quantity of the classes below: symbol in the paper, equation or assumption, unit, meaning."""
+@dataclass(frozen=True)
+class Term:
+    """One quantity of the theorem, by its symbol in the paper, its number there, or the assumption or remark."""
 
     symbol: str
     equation: str
+    value: float | None = field(default=None, kw_only=True)  # None: without a set, or as (C.66) fails
     unit: str
     meaning: str
 
@@ -88,7 +75,7 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1, in continuous time; `radius` is None where (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1 by (C.77) for V of (C.24), (C.73); no `radius` where (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
@@ -145,15 +132,9 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     delta_theta1 = p.k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
     delta_theta2 = p.k_theta * p.delta_omega + p.k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
     delta_V2 = (
-        p.C2_max * d.delta_z2
-        + d.delta_z1
-        + d.delta_Psi1
-        + d.delta_S1 * p.lambda_J * p.k_omega_d
-        + d.delta_R * p.lambda_J * p.k_omega_d_dot
-        + d.delta_alpha1 * p.lambda_J
-        + delta_theta2
-        + d.delta_Bu
-    )  # (C.71)
+        p.C2_max * d.delta_z2 + d.delta_z1 + d.delta_Psi1 + d.delta_S1 * p.lambda_J * p.k_omega_d
+        + d.delta_R * p.lambda_J * p.k_omega_d_dot + d.delta_alpha1 * p.lambda_J + delta_theta2 + d.delta_Bu
+    )  # (C.71)  # fmt: skip
     delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
     delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d) ** 2 / (2 * c0)  # (C.80)
     margin = c0 / 2 - delta_V1  # (C.66)
@@ -230,18 +211,14 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
     z = b.norm
 
     def Psi(omega: Floats, R: Floats) -> Floats:  # noqa: N802  # the paper's letter
-        Psi: Floats = -np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g))  # (C.43), (C.45)
-        return Psi
+        return np.asarray(-np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g)))  # (C.43), (C.45)
 
-    def alpha_bar(c: Coordinates) -> Floats:
-        alpha_dot: Floats = -x.sign[:, None] / 2 * C1 * times(c.A, c.omega_e)  # (C.46); of the true state it is α̇
-        return alpha_dot
-
+    alpha_dot, alpha_bar = (-x.sign[:, None] / 2 * C1 * times(c.A, c.omega_e) for c in (b, Q))  # (C.46)
     S_error = skew(x.omega) @ b.R - skew(x.omega_Q) @ Q.R
-    sides: dict[str, tuple[str, Floats, Any]] = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
-        "C.28": ("‖ε^Q − ε‖", (x.q_Q - q)[:, 1:], p.delta_eps),
-        "C.29": ("‖ω^Q − ω‖", x.omega_Q - x.omega, p.delta_omega),
-        "C.26": ("‖ω_e‖", b.omega_e, d.k_omega_e * z),
+    sides: dict[str, tuple[str, Floats, Floats | float]] = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
+        "C.28": ("‖ε^Q − ε‖", (x.q_Q - q)[:, 1:], p.delta_eps),  # (C.28)
+        "C.29": ("‖ω^Q − ω‖", x.omega_Q - x.omega, p.delta_omega),  # (C.29)
+        "C.26": ("‖ω_e‖", b.omega_e, d.k_omega_e * z),  # (C.26)
         "C.27": ("‖ω‖", x.omega, d.k_omega_e * z + p.k_omega_d),  # (C.27)
         "C.50": ("‖ω_e^Q − ω_e‖", Q.omega_e - b.omega_e, d.delta_omega_e),  # (C.50)
         "C.51": ("‖z₂^Q − z₂‖", Q.z2 - b.z2, d.delta_z2),  # (C.51)
@@ -249,12 +226,11 @@ def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lem
         "C.53": ("‖R_i^Q − R_i^b‖", Q.R - b.R, d.delta_R),  # (C.53)
         "C.54": ("‖Ψ − Ψ^Q‖", Psi(x.omega, b.R) - Psi(x.omega_Q, Q.R), d.delta_Psi1 + d.delta_Psi2 * z),  # (C.54)
         "C.55": ("‖S(ω)R_i^b − S(ω^Q)R_i^Q‖", S_error, d.delta_S1 + d.delta_S2 * z),  # (C.55)
-        "C.56": ("‖ᾱ^Q − α̇‖", alpha_bar(Q) - alpha_bar(b), d.delta_alpha1 + d.delta_alpha2 * z),  # (C.56)
+        "C.56": ("‖ᾱ^Q − α̇‖", alpha_bar - alpha_dot, d.delta_alpha1 + d.delta_alpha2 * z),  # (C.56)
         "C.57": ("‖Φ − Φ^Q‖", np.abs(x.omega_Q - x.omega).max(axis=1, keepdims=True), d.delta_Phi),  # (C.57)
     }
     return [
-        Inequality(number, what, norm(error), np.broadcast_to(right, z.shape))
-        for number, (what, error, right) in sides.items()
+        Inequality(n, what, norm(error), np.broadcast_to(most, z.shape)) for n, (what, error, most) in sides.items()
     ]
 
 
@@ -268,18 +244,14 @@ def skew(v: Floats) -> Floats:
 def rotation(q: Floats) -> Floats:
     """R(q) of (C.8) for each row: body to inertial. Shape (n, 3, 3)."""
     S = skew(q[:, 1:])
-    R: Floats = np.identity(3) + 2 * q[:, :1, None] * S + 2 * S @ S
-    return R
+    return np.asarray(np.identity(3) + 2 * q[:, :1, None] * S + 2 * S @ S)
 
 
 def times(matrices: Floats, vectors: Floats) -> Floats:
     """The matrix of each row times its vector, or times one common vector. Shape (n, 3)."""
-    product: Floats = np.einsum("nij,nj->ni", matrices, np.broadcast_to(vectors, matrices.shape[:2]))
-    return product
+    return np.asarray(np.einsum("nij,nj->ni", matrices, np.broadcast_to(vectors, matrices.shape[:2])))
 
 
 def norm(errors: Floats) -> Floats:
     """Length of each vector, or induced norm of each matrix. Shape (n,)."""
-    axes = tuple(range(1, errors.ndim))
-    lengths: Floats = np.linalg.norm(errors, 2, axis=axes if len(axes) > 1 else 1)
-    return lengths
+    return np.asarray(np.linalg.norm(errors, 2, axis=1 if errors.ndim == 2 else (1, 2)))

@@ -11,40 +11,34 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from math import asin, degrees, floor, hypot, inf, radians, sin, sqrt
+from math import asin, degrees, floor, hypot, inf, radians, sin
 from typing import Any, Final, NamedTuple, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aeroloop.protocol.messages.operator import Change, Hold, in_force
-from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.motion import START_WITHIN_DEG
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
-from aeroloop.service.theorem.extremes import BoundlessError, Extremes, chords, extremes, motors
-from aeroloop.service.theorem.feedback import NoTheoremError, feedback_of
-from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
-from aeroloop.service.theorem.plant_bounds import NO_ENCODER, PlantBounds, paper_body, plant_bounds
+from aeroloop.service.theorem.extremes import BoundlessError, Extremes, extremes, motors
+from aeroloop.service.theorem.invariant import Reach, reach, without_error
+from aeroloop.service.theorem.premises import (
+    NO_ENCODER,
+    NoTheoremError,
+    PlantBounds,
+    Premises,
+    feedback_of,
+    plant_bounds,
+    premises,
+    quantization_error,
+)
 
 MOST_DELAY_S: Final = 1.0
 RESOLUTION_S: Final = 1e-5
 """The search of the largest delay."""
-
-
-class CertificateTerm(BaseModel):
-    """One quantity of the theorem, by its symbol in the paper."""
-
-    model_config = ConfigDict(frozen=True)
-
-    symbol: str
-    equation: str = Field(description="number in the paper, or assumption or remark")
-    value: float | None = Field(description="null where it does not exist: without a set, or as (C.66) fails")
-    unit: str
-    meaning: str
 
 
 class Certificate(BaseModel):
@@ -74,7 +68,7 @@ class Certificate(BaseModel):
     )
     assumptions: list[str] = Field(description="what is assumed, each with the key or the option that states it")
     violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
-    terms: list[CertificateTerm]
+    terms: list[Term]
 
     @property
     def verdict(self) -> str:
@@ -113,13 +107,8 @@ class Evaluated:
     plant_reach: Reach | None
 
 
-def evaluate(
-    settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0, start_deg: float = START_WITHIN_DEG
-) -> Evaluated:
-    """The quantities of a certificate; arguments and errors as of `certify`.
-
-    The assumed attitude error is widened to that of the sets, so that no certificate contradicts itself.
-    """
+def evaluate(settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0) -> Evaluated:
+    """The quantities of a certificate; arguments and errors as of `certify`."""
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
@@ -128,75 +117,30 @@ def evaluate(
     bounds = plant_bounds(settings, disturbance is not None)
     if bounds.held_roll and desired.rolls:
         bounds = replace(bounds, unproven=[*bounds.unproven, "reference: it rolls, and the plant's roll is held"])
-    body = premises(settings, desired, paper_body(settings), stated, late_s)
+    body = premises(settings, desired, PlantBounds(settings.loop.period), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
     body_reach, plant_reach = reach(body), reach(plant)
     paper = None
-    if isinstance(settings.law, AdaptiveSettings):
-        start = radians(min(180.0, start_deg))
-        error = max(start, *(2 * asin(at.eps_e) for at in (body_reach, plant_reach) if at), 0.0)
-        known = _known(settings, settings.law, body, error)
+    if isinstance(law := settings.law, AdaptiveSettings):
+        # The assumed error is widened to that of the sets, so that no certificate contradicts itself.
+        half_angle = max(radians(START_WITHIN_DEG) / 2, *(asin(at.eps_e) for at in (body_reach, plant_reach) if at), 0)
+        known = Known(
+            lambda_J=max(law.inertia), weight=body.weight, norm_B=body.norm_B,
+            C1_min=min(law.C1), C1_max=max(law.C1), C2_min=min(law.C2), C2_max=max(law.C2),
+            delta_eps=quantization_error(settings.wire.attitude, 3),
+            delta_omega=quantization_error(settings.wire.rate, 3), delta_u=body.delta_u,
+            k_omega_d=desired.rate, k_omega_d_dot=desired.acceleration,
+            half_angle_d=desired.half_angle, half_angle_e=half_angle,
+            k_theta=hypot(*law.damping_estimate) + law.damping_bound, k_theta_err=body.law.theta_error,
+            k_tau_d=body.plant.torque,
+        )  # fmt: skip
         lemma = lemma_1(known)
         paper = Paper(known, lemma, theorem_1(known, lemma))
     return Evaluated(paper, body, plant, body_reach, plant_reach)
 
 
-def premises(
-    settings: Settings, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
-) -> Premises:
-    """Premises of the invariant set, with a further torque [N·m] and a further age of every command [s]."""
-    wire, law = settings.wire, settings.law
-    gravity = law.mass * law.gravity
-    return Premises(
-        law=feedback_of(law),
-        desired=desired,
-        plant=replace(plant, age=plant.age + late_s, torque=plant.torque + disturbance),
-        J=law.inertia,
-        weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
-        weight_roll=abs(law.centre_of_mass[1]) * gravity,
-        norm_B=float(np.linalg.norm(motors(settings), 2)),
-        delta_omega=_error(wire.rate, 3) + plant.delta_omega,
-        delta_u=_error(wire.voltage, wire.actuators),
-        delta_q=chords(desired, _error(wire.attitude, 1) + plant.delta_eps),
-        period=settings.loop.period,
-    )
-
-
-def _known(settings: Settings, law: AdaptiveSettings, body: Premises, error: float) -> Known:
-    return Known(
-        lambda_J=max(law.inertia),
-        weight=body.weight,
-        norm_B=body.norm_B,
-        C1_min=min(law.C1),
-        C1_max=max(law.C1),
-        C2_min=min(law.C2),
-        C2_max=max(law.C2),
-        delta_eps=_error(settings.wire.attitude, 3),
-        delta_omega=_error(settings.wire.rate, 3),
-        delta_u=body.delta_u,
-        k_omega_d=body.desired.rate,
-        k_omega_d_dot=body.desired.acceleration,
-        half_angle_d=body.desired.half_angle,
-        half_angle_e=error / 2,
-        k_theta=hypot(*law.damping_estimate) + law.damping_bound,
-        k_theta_err=body.law.theta_error,
-        k_tau_d=body.plant.torque,
-    )
-
-
-@lru_cache(maxsize=64)
-def _error(signal: SignalSpec, elements: int) -> float:
-    """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
-    return sqrt(elements) * signal.quantizer().bound
-
-
 def certify(
-    settings: Settings,
-    *,
-    disturbance: float | None = None,
-    late_s: float = 0.0,
-    start_deg: float = START_WITHIN_DEG,
-    margins: bool = True,
+    settings: Settings, *, disturbance: float | None = None, late_s: float = 0.0, margins: bool = True
 ) -> Certificate:
     """The certificate of a configuration.
 
@@ -204,7 +148,6 @@ def certify(
         settings: The configuration.
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         late_s: Further age of a command, by delay, or by lost frames where the law has no integral [s].
-        start_deg: Assumed bound of the attitude error, for Lemma 1 [deg].
         margins: Search delay_ms and lost_frames, too.
 
     Raises:
@@ -212,18 +155,26 @@ def certify(
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    e = evaluate(settings, disturbance=disturbance, late_s=late_s, start_deg=start_deg)
+    e = evaluate(settings, disturbance=disturbance, late_s=late_s)
+    return _certificate(settings, e, disturbance, margins)
+
+
+def _certificate(settings: Settings, e: Evaluated, disturbance: float | None, margins: bool) -> Certificate:
     violated = _violated(settings, e, e.plant, e.plant_reach)
     delay = _largest_delay(settings, e) if margins and not violated else None
-    law, at = e.plant.law, e.plant_reach
-    constant = reach(replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))) if law.reach else at
+    law = e.plant.law
+    constant = replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))
+    reached = (e.body_reach, e.plant_reach, reach(constant) if law.reach else e.plant_reach)
+    (radius, deg), (plant_radius, plant_deg), (constant_radius, _) = (
+        (at.radius, at.degrees) if at else (None, None) for at in reached
+    )
     return Certificate(
         holds=not violated,
-        pointwise_radius=None if e.body_reach is None else e.body_reach.radius,
-        pointwise_deg=None if e.body_reach is None else degrees(2 * asin(e.body_reach.eps_e)),
-        plant_radius=None if at is None else at.radius,
-        plant_deg=None if at is None else degrees(2 * asin(at.eps_e)),
-        constant_radius=None if constant is None else constant.radius,
+        pointwise_radius=radius,
+        pointwise_deg=deg,
+        plant_radius=plant_radius,
+        plant_deg=plant_deg,
+        constant_radius=constant_radius,
         delay_ms=None if delay is None else floor(delay * 1e5) / 100,
         lost_frames=None if delay is None or any(law.ki) else floor(delay / settings.loop.period),
         assumptions=list(_assumptions(settings, e, disturbance)),
@@ -270,10 +221,10 @@ def promise(settings: Settings, changes: Sequence[Change] = (), described: Mappi
     except BoundlessError as error:
         return Promise(law, None, None, f"Nothing is promised: {error}.")
     certificate = None
-    if (law, reference) == (settings.law, settings.reference) and described is not None:
+    if begun == settings and described is not None:
         with suppress(ValidationError):  # of another version
             certificate = Certificate.model_validate(described)
-    certificate = certificate or certify(begun)
+    certificate = certificate or _certificate(begun, bounds, None, margins=False)
     return Promise(law, certificate, bounds, certificate.verdict)
 
 
@@ -336,17 +287,17 @@ def largest_voltage(settings: Settings, desired: Extremes, at: Reach) -> float:
 
 def _unproven(p: Premises, body: Premises) -> str:
     """Which properties of the plant, removed one after the other, leave a set that is proven."""
-    no_theta = p.law._replace(radius=0.0, reach=0.0, Gamma=(0.0, 0.0, 0.0))
-    of_plant, body_plant, torque = p.plant, body.plant, p.plant.torque + p.plant.steady
-    of_body: dict[str, Any] = {"delta_q": body.delta_q} if p.plant.delta_eps else {}
-    without: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
-        (f"rotors that lag by {of_plant.lag:.3g} s", {}, {"lag": 0.0, "uneven": 0.0}),
-        (f"commands {of_plant.age * 1e3:.3g} ms old", {}, {"age": 0.0}),
+    plant, torque = p.plant, p.plant.torque + p.plant.steady
+    of_body: dict[str, Any] = {"delta_q": body.delta_q} if plant.delta_eps else {}
+    known_theta = p.law._replace(radius=0.0, reach=0.0, Gamma=(0.0, 0.0, 0.0))
+    without: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (  # name, changed premises, changed plant
+        (f"rotors that lag by {plant.lag:.3g} s", {}, {"lag": 0.0, "uneven": 0.0}),
+        (f"commands {plant.age * 1e3:.3g} ms old", {}, {"age": 0.0}),
         ("the held roll (u₁ is never applied)", {}, {"held_roll": False}),
         ("the rate sensor's errors", {"delta_omega": body.delta_omega}, {"encoder": NO_ENCODER}),
-        (f"a torque of {torque:.2g} N·m", {}, {"torque": body_plant.torque, "steady": 0.0}),
+        (f"a torque of {torque:.2g} N·m", {}, {"torque": body.plant.torque, "steady": 0.0}),
         ("the attitude sensor's error", of_body, {}),
-        (f"‖θ̃‖ up to {p.law.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"law": no_theta}, {}),
+        (f"‖θ̃‖ up to {p.law.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"law": known_theta}, {}),
         ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}, {}),
     )
     names = list[str]()
@@ -386,12 +337,10 @@ _REACH: Final = {
 }
 
 
-def _terms(e: Evaluated) -> Iterator[CertificateTerm]:
+def _terms(e: Evaluated) -> Iterator[Term]:
     """What the paper says of its law, then what the configured plant's set is made of."""
     for part in e.paper or ():
-        hints: dict[str, Any] = get_type_hints(type(part), include_extras=True)
-        for name, hint in hints.items():
-            yield CertificateTerm(value=getattr(part, name), **hint.__metadata__[0]._asdict())
+        for name, hint in get_type_hints(type(part), include_extras=True).items():
+            yield replace(hint.__metadata__[0], value=getattr(part, name))
     for name, term in _REACH.items():
-        value = None if e.plant_reach is None else getattr(e.plant_reach, name)
-        yield CertificateTerm(value=value, **term._asdict())
+        yield replace(term, value=getattr(e.plant_reach, name, None))

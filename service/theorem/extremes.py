@@ -67,12 +67,12 @@ def extremes(settings: Settings) -> Extremes:
             )
 
         def weighed(w: float) -> float:
-            def of(at: Angles) -> Floats:
-                return np.asarray(np.abs(eps := vectors(at)).sum(axis=1) + w * np.linalg.norm(eps, axis=1))
+            return trajectory.largest(
+                lambda at: np.linalg.norm(vectors(at), 1, axis=1) + w * np.linalg.norm(vectors(at), axis=1),
+                half * [sqrt(3) + w, 1, 1, 1],
+            )
 
-            return trajectory.largest(of, half * [sqrt(3) + w, 1, 1, 1])
-
-        largest_sine = trajectory.largest(lambda at: np.sin(half_angles(at)), half)
+        largest_sine = trajectory.largest(lambda at: np.linalg.norm(vectors(at), axis=1), half)
         found = Extremes(
             rate=slack * trajectory.fastest(),
             acceleration=slack * trajectory.largest(lambda at: np.linalg.norm(body_rates(at)[1], axis=1), changes),
@@ -134,16 +134,11 @@ def body_rates(angles: Angles) -> tuple[Floats, Floats]:
     """ω_d and its derivative in the desired body frame [rad/s, rad/s²]. Shapes (n, 3)."""
     (roll, pitch, _), (dr, dp, dy), (ddr, ddp, ddy) = angles.angle.T, angles.rate.T, angles.acceleration.T
     sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
-    rate = np.stack([dr - dy * sp, dp * cr + dy * cp * sr, -dp * sr + dy * cp * cr], axis=1)
-    acceleration = np.stack(
-        [
-            ddr - ddy * sp - dy * dp * cp,
-            ddp * cr - dp * dr * sr + (ddy * cp - dy * dp * sp) * sr + dy * cp * dr * cr,
-            -ddp * sr - dp * dr * cr + (ddy * cp - dy * dp * sp) * cr - dy * cp * dr * sr,
-        ],
-        axis=1,
-    )
-    return rate, acceleration
+    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
+    rate = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=1)
+    about_y = ddp * cr - dp * dr * sr + across_dot * sr + across * dr * cr
+    about_z = across_dot * cr - across * dr * sr - ddp * sr - dp * dr * cr
+    return rate, np.stack([ddr - ddy * sp - dy * dp * cp, about_y, about_z], axis=1)
 
 
 def feedforward(angles: Angles, law: LawSettings) -> Floats:
@@ -155,14 +150,6 @@ def feedforward(angles: Angles, law: LawSettings) -> Floats:
     weight = np.cross(np.array(law.centre_of_mass), -law.mass * law.gravity * up)
     torque: Floats = np.cross(omega, J * omega) - weight + J * omega_dot
     return torque
-
-
-def half_angles(angles: Angles) -> Floats:
-    """Half the angle of each q_d from [1, 0], for the nearer of ±q_d, 0…π/2 [rad]. Shape (n,)."""
-    (a, b, c) = angles.angle.T / 2
-    eta_d = np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c)
-    nearest: Floats = np.arccos(np.minimum(1.0, np.abs(eta_d)))
-    return nearest
 
 
 def chords(desired: Extremes, delta: float) -> Callable[[float], float]:
@@ -188,13 +175,6 @@ def chords(desired: Extremes, delta: float) -> Callable[[float], float]:
 
 def vectors(angles: Angles) -> Floats:
     """ε_d of each q_d. Shape (n, 3)."""
-    (a, b, c) = angles.angle.T / 2
-    eps: Floats = np.stack(
-        [
-            np.sin(a) * np.cos(b) * np.cos(c) - np.cos(a) * np.sin(b) * np.sin(c),
-            np.cos(a) * np.sin(b) * np.cos(c) + np.sin(a) * np.cos(b) * np.sin(c),
-            np.cos(a) * np.cos(b) * np.sin(c) - np.sin(a) * np.sin(b) * np.cos(c),
-        ],
-        axis=1,
-    )
+    (a, b, c), (x, y, z) = np.cos(angles.angle.T / 2), np.sin(angles.angle.T / 2)
+    eps: Floats = np.stack([x * b * c - a * y * z, a * y * c + x * b * z, a * b * z - x * y * c], axis=1)
     return eps

@@ -7,74 +7,23 @@ and never leaves. README.md derives every step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import asin, cos, hypot, inf, isfinite, pi, sin, sqrt, tan
+from math import asin, cos, degrees, hypot, inf, isfinite, pi, sin, sqrt, tan
 from typing import Final
 
 import numpy as np
 
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.reference import Floats
 from aeroloop.service.theorem.bounds import Coordinates, norm
-from aeroloop.service.theorem.extremes import Extremes
-from aeroloop.service.theorem.feedback import Feedback
-from aeroloop.service.theorem.linear import Axis, Responses, responses
-from aeroloop.service.theorem.plant_bounds import PlantBounds
+from aeroloop.service.theorem.linear import Responses, responses
+from aeroloop.service.theorem.premises import Premises
 
 _MOST_ITERATIONS: Final = 400
 _INFLATED: Final = 1.001
 """Each guess of the fixed point is raised by this, so that one that holds is found soon; the bound is as much wider."""
 _MOST: Final = 1e6
 """Disturbance beyond which no bound is sought."""
-
-
-@dataclass(frozen=True)
-class Premises:
-    """What the set is computed from. Letters as in `bounds`; vectors are diagonals.
-
-    Attributes:
-        law: The law near its reference.
-        desired: The reference.
-        plant: What the plant does beyond the paper's equations, and any further torque or age of a command.
-        J: Inertia [kg·m²].
-        weight: ‖r_g‖ m g [N·m].
-        weight_roll: |r_g,y| m g: the weight's torque about the held roll [N·m].
-        norm_B: ‖B‖ [N·m/V].
-        delta_omega: Largest ‖ω^Q − ω‖, without a rate's errors by encoders [rad/s].
-        delta_u: Largest ‖u^Q − u‖ [V].
-        delta_q: Largest ‖q^Q − q‖ where the attitude errs by half an angle [rad].
-        period: Of the loop [s].
-    """
-
-    law: Feedback
-    desired: Extremes
-    plant: PlantBounds
-    J: Vector
-    weight: float
-    weight_roll: float
-    norm_B: float
-    delta_omega: float
-    delta_u: float
-    delta_q: Callable[[float], float]
-    period: float
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Each axis that differs; with a held roll x and z mix, and their means stand for both."""
-        law, encoder = self.law, self.plant.encoder
-        gains = np.array([law.kp, law.kd, law.alpha, law.ki, law.share, law.centre, self.J]).T.tolist()
-        if self.plant.held_roll:
-            x, y, z = gains
-            gains = [y, [*((a + b) / 2 for a, b in zip(x[:-1], z[:-1], strict=True)), max(self.J)]]
-        late = self.plant.lag, encoder.bandwidth, encoder.ratio
-        shares = [1.0, self.phi, 1.0] if self.plant.held_roll else [1.0] * 3
-        return tuple(dict.fromkeys(Axis(*[*gain, share, *late]) for gain, share in zip(gains, shares, strict=False)))
-
-    @property
-    def phi(self) -> float:
-        """φ: the mean share of a yaw torque that the motors produce along the reference [1]."""
-        return (1 + cos(self.desired.tilt) ** 2) / 2 if self.plant.held_roll else 1.0
 
 
 @dataclass(frozen=True)
@@ -94,6 +43,11 @@ class Reach:
     deviation: float = 0.0  # largest torque of the command beyond that of the reference [N·m]
     integral: float = 0.0  # largest torque of the integral, or estimate of a constant torque [N·m]
 
+    @property
+    def degrees(self) -> float:
+        """The attitude error within it [deg]."""
+        return degrees(2 * asin(self.eps_e))
+
 
 def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
@@ -109,7 +63,7 @@ def reach(p: Premises, start: float = 0.0) -> Reach | None:
     D: tuple[float, ...] = (0.0,) * 7
     eps_e = 0.0
     for _ in range(_MOST_ITERATIONS):  # bounds grow with D, and D with the bounds: from 0 to the least
-        sizes = {name: gain(start, D) for name, gain in linear.gains.items()}
+        sizes = {name: float(gain @ (start, *D)) for name, gain in linear.gains.items()}
         found = _bounds_after(p, linear, sizes, eps_e)
         if found is None or not all(isfinite(d) and d < _MOST for d in found.D):
             return None
@@ -119,19 +73,6 @@ def reach(p: Premises, start: float = 0.0) -> Reach | None:
     return None
 
 
-def largest_start(p: Premises) -> float:
-    """The largest ‖x(t₀)‖ from which the set is reached, within one percent; 0 if there is no set."""
-    if reach(p) is None:
-        return 0.0
-    low, high = 0.0, 1e-3
-    while high < 10 and reach(p, high) is not None:
-        low, high = high, 2 * high
-    while high - low > 0.01 * high:
-        middle = (low + high) / 2
-        low, high = (middle, high) if reach(p, middle) is not None else (low, middle)
-    return low
-
-
 def distance(p: Premises, c: Coordinates, sign: Floats, theta_error: Floats, desired_rate: Floats) -> Floats:
     """‖x‖ at n instants, or a bound of it where the roll is held: how far (ε̃, z₂) is from balancing the slow torque.
 
@@ -139,12 +80,30 @@ def distance(p: Premises, c: Coordinates, sign: Floats, theta_error: Floats, des
     [N·m·s/rad], and `desired_rate` ω_d in the desired body frame [rad/s], (n, 3).
     """
     eps, share, linear = sign[:, None] * c.eps_e, np.array(p.law.share), responses(p.axes)
+    if linear is None:
+        return np.full(len(eps), np.inf)
     if not p.plant.held_roll:
         balance = -desired_rate * theta_error / np.array(p.law.kp) * (np.array(p.law.ki) == 0)
-        steady = 0.0 if linear is None else linear.z * p.plant.steady  # balanced in a direction that is not known
+        steady = linear.z * p.plant.steady  # balanced in a direction that is not known
         return norm(np.hstack([eps - balance, c.z2 - share * balance])) + steady
-    farthest = reach(p, largest_start(p))
-    return norm(np.hstack([eps, c.z2])) + (inf if farthest is None or linear is None else linear.z * farthest.slow)
+    slow = [_slow_torque(p, float(each))[0] for each in norm(eps)]
+    return norm(np.hstack([eps, c.z2])) + [linear.z * most if most < inf else inf for most in slow]
+
+
+def _slow_torque(p: Premises, eps_e: float) -> tuple[float, float, float, float]:
+    """Bounds while ‖ε̃‖ ≤ `eps_e`: of the slow torque, balanced at x = K times it, and infinite beyond what is proven.
+
+    Then of its parts, −diag(R_d ω_d) θ̃ and what is steady and, with a held roll, what u₁ should have added to the yaw;
+    and of the pitch, which errs by no more than the attitude.
+    """
+    if not eps_e < sin(pi / 4):
+        return inf, inf, inf, inf
+    push, pitch, roll = p.law.theta_error * p.desired.axis_rate + p.plant.steady, 0.0, 0.0
+    if p.plant.held_roll:
+        pitch = p.desired.tilt + 2 * asin(eps_e)
+        roll = p.law.estimate * p.desired.rate + max(p.J) * p.desired.acceleration + p.weight_roll
+        push += sin(pitch) * roll
+    return push / cos(pitch) ** 2 if pitch < pi / 2 else inf, push, roll, pitch
 
 
 def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: float) -> Reach | None:
@@ -158,20 +117,10 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     j, spread = max(p.J), max(p.J) - min(p.J)
     kp, kd, alpha, ki, share = (max(gain) for gain in (law.kp, law.kd, law.alpha, law.ki, law.share))
 
-    if not eps_e < sin(pi / 4):
-        return None
-    # With a held roll, the pitch errs by no more than the attitude.
-    pitch = p.desired.tilt + 2 * asin(eps_e) if plant.held_roll else 0.0
-    if not pitch < pi / 2:
-        return None
-    phi, sine = cos(pitch) ** 2, sin(pitch)
-    # The slow torque: −diag(R_d ω_d) θ̃, what is steady, and with a held roll what u₁ should have added to the yaw.
-    roll = (law.estimate * rate_d + j * rate_d_dot + p.weight_roll) if plant.held_roll else 0.0
-    push = law.theta_error * p.desired.axis_rate + plant.steady + sine * roll
-    slow = push / phi
+    slow, push, roll, pitch = _slow_torque(p, eps_e)
     needed = at["eps"] + linear.eps * slow
     eps_e = max(eps_e, needed)
-    if not eps_e < sin(pi / 4):
+    if not (slow < inf and eps_e < sin(pi / 4)):
         return None
     zeta = 2 * sin(asin(eps_e) / 2)  # ‖z₁‖
     turned = 2 * eps_e * rate_d  # ‖R ω_d − R_d ω_d‖
@@ -234,9 +183,28 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     gap = at["gap"] + plant.lag * rest_dot + 2 * noise + hold + steady * encoder.ripple
     gap += 2 * steady * encoder.angle / plant.lag if plant.lag else 0.0
     d5 = noise + hold + plant.uneven * gap
-    if plant.held_roll:
-        fast, d2, push_dot = _with_held_roll(p, at, fast, d2, push_dot, roll, push, pitch, eps_e, zeta, theta_dot)
-        d2 += (j / min(p.J) - 1) * (d5 + steady * encoder.ripple)
+    if plant.held_roll:  # README, step 6; of what the motors do about the roll's axis only part acts
+        phi, sine, total = cos(pitch) ** 2, sin(pitch), [a + b for a, b in zip(law.kd, law.alpha, strict=True)]
+        # What u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts.
+        rest = law.estimate * omega_e + j * omega_e * rate_d + alpha * zeta * omega_e + spread * omega**2
+        fast += sine * rest
+        roll_dot = (
+            law.estimate * accelerated + theta_dot * (axis_omega - omega_e)
+            + j * (rate_d_ddot + omega * rate_d_dot) + p.weight_roll * omega
+        )  # fmt: skip
+        push_dot = (push_dot + sine * roll_dot + axis_omega * roll + push * axis_omega * (2 * tan(pitch) + 2)) / phi
+        across = (  # along n, the axis that the mechanism holds, where |n·ε̃| is of second order and |n·ω_e| ≤ `turned`
+            j * (rate_d_dot * 2 * eps_e + (rate_d + omega) * omega_e)
+            + kp * eps_e**2 / (2 * (1 - eps_e**2)) + max(total) * turned + alpha * zeta * omega_e
+            + ki * at["integral"]
+            + plant.lag * axis_omega * at["feedback"]  # of the rotors' lag: n turns meanwhile
+        )  # fmt: skip
+        d2 = hypot(d2 + sine * rest + max(1 - p.phi, p.phi - phi) * at["applied"], across)
+        d2 += (j / min(p.J) - 1) * (at["applied"] + law.theta_error * omega_e + fast + d5 + steady * encoder.ripple)
+        d2 += (
+            _spread(law.kp) * eps_e + _spread(total) * omega_e + _spread(law.ki) * at["integral"]
+            + _spread(law.centre) * (plant.lag + encoder.lag) * at["omega_dot"]
+        )  # fmt: skip
     deviation = (
         at["feedback"] + slow + noise + law.coulomb + steady * encoder.ripple + law.estimate * axis_omega
         + p.weight * 2 * eps_e + spread * omega**2 + alpha * zeta * omega_e
@@ -249,46 +217,6 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
         half_angle=half_angle, slow=slow, fast=fast, noise=noise, hold=hold, deviation=deviation,
         integral=ki * at["integral"] + slow,
     )  # fmt: skip
-
-
-def _with_held_roll(
-    p: Premises, at: dict[str, float], fast: float, d2: float, push_dot: float,
-    roll: float, push: float, pitch: float, eps_e: float, zeta: float, theta_dot: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """The fast torque, D₂ and the slow torque's derivative where a mechanism holds the roll; README, step 6."""
-    law, phi, sine = p.law, cos(pitch) ** 2, sin(pitch)
-    j, jmin, spread = max(p.J), min(p.J), max(p.J) - min(p.J)
-    total = [a + b for a, b in zip(law.kd, law.alpha, strict=True)]
-    omega_e, kd, alpha = at["omega"], max(total), max(law.alpha)
-    omega = p.desired.rate + omega_e
-    pitch_rate = axis_omega = p.desired.axis_rate + 2 * eps_e * p.desired.rate + omega_e
-    # what u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts
-    rest = law.estimate * omega_e + j * omega_e * p.desired.rate + alpha * zeta * omega_e + spread * omega**2
-    fast += sine * rest
-    applied = at["applied"]
-    d2 += sine * rest + max(1 - p.phi, p.phi - phi) * applied
-    roll_dot = (
-        law.estimate * (p.desired.acceleration + omega_e * p.desired.rate)
-        + theta_dot * (axis_omega - omega_e)
-        + j * (p.desired.jerk + omega * p.desired.acceleration)
-        + p.weight_roll * omega
-    )
-    push_dot += sine * roll_dot + pitch_rate * roll
-    push_dot = push_dot / phi + push * pitch_rate * (2 * tan(pitch) + 2) / phi
-    second = eps_e**2 / (2 * (1 - eps_e**2))  # |n·ε̃|, n the axis that the mechanism holds
-    turned = 2 * eps_e * p.desired.rate  # |n·ω_e|
-    across = (
-        j * (p.desired.acceleration * 2 * eps_e + (p.desired.rate + omega) * omega_e)
-        + max(law.kp) * second + kd * turned + alpha * zeta * omega_e
-        + max(law.ki) * at["integral"]
-        + p.plant.lag * pitch_rate * at["feedback"]  # of the rotors' lag: n turns meanwhile
-    )  # fmt: skip
-    d2 = hypot(d2, across) + (j / jmin - 1) * (applied + law.theta_error * omega_e + fast)
-    uneven = (
-        _spread(law.kp) * eps_e + _spread(total) * omega_e + _spread(law.ki) * at["integral"]
-        + _spread(law.centre) * (p.plant.lag + p.plant.encoder.lag) * at["omega_dot"]
-    )  # fmt: skip
-    return fast, d2 + uneven, push_dot
 
 
 def _spread(gain: Sequence[float]) -> float:

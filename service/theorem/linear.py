@@ -17,14 +17,10 @@ import numpy as np
 
 from aeroloop.service.control.reference import Floats
 
-_STEP: Final = 0.1
-"""First step of e^{As}, in time constants of the fastest mode."""
-_BLOCK: Final = 256
-"""Steps until the step doubles, so that every mode is sampled finely while it lasts."""
-_SLACK: Final = 1.002
-"""By which trapezoids, and what lies between two steps, are rounded up."""
-_END: Final = 20.0
-"""Time constants of the slowest mode after which e^{As} counts as 0."""
+_STEP: Final = 0.1  # first step of e^{As}, in time constants of the fastest mode
+_BLOCK: Final = 256  # steps until the step doubles, so that every mode is sampled finely while it lasts
+_SLACK: Final = 1.002  # by which trapezoids, and what lies between two steps, are rounded up
+_END: Final = 20.0  # time constants of the slowest mode after which e^{As} counts as 0
 _MOST_BLOCKS: Final = 40
 
 OUTPUTS: Final = {
@@ -60,21 +56,10 @@ class System(NamedTuple):
     M: Floats
 
 
-class Gain(NamedTuple):
-    """Gain of an output: from ‖x(t₀)‖, and from D₁ to D₅."""
-
-    start: float
-    forced: tuple[float, ...]
-
-    def __call__(self, start: float, D: tuple[float, ...]) -> float:
-        """The largest ‖h x‖."""
-        return self.start * start + sum(gain * size for gain, size in zip(self.forced, D, strict=True))
-
-
 class Responses(NamedTuple):
-    """Gains of every output, and ‖·‖ of w_s for ε̃ and (ε̃, z₂) at which it is balanced."""
+    """Gain of every output, from ‖x(t₀)‖ and D₁ to D₇, (8,); ‖·‖ of w_s for ε̃ and (ε̃, z₂) at which it is balanced."""
 
-    gains: dict[str, Gain]
+    gains: dict[str, Floats]
     eps: float
     z: float
 
@@ -84,42 +69,32 @@ def system(axis: Axis) -> System:
     names = ["eps", "omega", *["integral"] * bool(axis.ki), *["rate", "slope"] * bool(axis.bandwidth)]
     names += ["torque"] * bool(axis.lag)
     unit = dict(zip(names, np.identity(len(names)), strict=True))
+    at, none = {name: i for i, name in enumerate(names)}, np.zeros(len(names))
     rate = unit.get("rate", unit["omega"])  # as received
-    at = {name: i for i, name in enumerate(names)}
+    integral = unit.get("integral", none)
     damping = axis.damping if len(names) > 2 + bool(axis.ki) else 0.0  # else the law cancels it
-    f = -axis.kp * unit["eps"] - (axis.kd + axis.alpha - damping) * rate
-    if axis.ki:
-        f -= axis.ki * unit["integral"]
+    f = -axis.kp * unit["eps"] - (axis.kd + axis.alpha - damping) * rate - axis.ki * integral
     applied = unit.get("torque", f)
-    A: Floats = np.zeros((len(names), len(names)))
-    E: Floats = np.zeros((len(names), 5))
+    A, E = np.zeros((len(names), len(names))), np.zeros((len(names), 5))
     A[0] = unit["omega"] / 2
     A[1] = axis.phi * (applied - damping * unit["omega"]) / axis.J
     E[0, 0], E[1, 0], E[1, 1] = 1.0, -2 * axis.alpha / axis.J, 1 / axis.J
+    M = np.zeros((len(names), 2))
+    M[:2] = [[1.0, 0.0], [-axis.share, 1.0]]
     if axis.ki:
         A[at["integral"]], E[at["integral"], 3] = rate + axis.share * unit["eps"], 1.0
     if axis.bandwidth:
-        A[at["rate"]] = unit["slope"]
+        A[at["rate"]], M[at["rate"]] = unit["slope"], M[1]  # at the start filter and rotors are in balance
         A[at["slope"]] = axis.bandwidth**2 * (unit["omega"] - rate) - 2 * axis.ratio * axis.bandwidth * unit["slope"]
     if axis.lag:
-        A[at["torque"]], E[at["torque"], 4] = (f - applied) / axis.lag, 1 / axis.lag
+        A[at["torque"]], E[at["torque"], 4], M[at["torque"]] = (f - applied) / axis.lag, 1 / axis.lag, f.dot(M)
     else:
         E[1, 4] = 1 / axis.J
-    K: Floats = np.asarray(-np.linalg.solve(A, E[:, 1]) * axis.phi, dtype=np.float64)
+    K: Floats = np.asarray(-np.linalg.solve(A, E[:, 1]) * axis.phi, np.float64)
     E[:, 2] = -K
     z = np.stack([unit["eps"], unit["omega"] + axis.share * unit["eps"]])
-    M: Floats = np.zeros((len(names), 2))
-    M[:2] = [[1.0, 0.0], [-axis.share, 1.0]]
-    if axis.bandwidth:
-        M[at["rate"]] = M[1]  # the filter and the rotors in balance
-    if axis.lag:
-        M[at["torque"]] = f.dot(M)
-    outputs = {
-        "eps": unit["eps"], "omega": unit["omega"], "integral": unit.get("integral", 0 * f), "feedback": f,
-        "applied": applied, "gap": f - applied,
-    }  # fmt: skip
-    outputs = {"z": z, **{name: row[None] for name, row in outputs.items()}}
-    return System(A, E, outputs, K, M)
+    rows = {"eps": unit["eps"], "omega": unit["omega"], "integral": integral, "feedback": f, "applied": applied}
+    return System(A, E, {"z": z, **{name: row[None] for name, row in rows.items()}, "gap": (f - applied)[None]}, K, M)
 
 
 @lru_cache(maxsize=256)
@@ -138,29 +113,25 @@ def responses(axes: tuple[Axis, ...]) -> Responses | None:
         return None
     s = np.append(0.0, np.cumsum(np.repeat(_STEP / fastest * 2.0 ** np.arange(blocks), _BLOCK)))
     flows = [_flow(one.A, s) for one in systems]
-    gains = dict[str, Gain]()
+    gains = dict[str, Floats]()
     for name, of in OUTPUTS.items():
         rows = [one.outputs[of or name] for one in systems]
         rates = _gain([row @ one.A @ flow for row, one, flow in zip(rows, systems, flows, strict=True)], systems, s)
-        through = np.max([np.linalg.norm(row @ one.E, axis=0) for row, one in zip(rows, systems, strict=True)], axis=0)
-        rates = Gain(rates.start, tuple(a + float(b) for a, b in zip(rates.forced, through, strict=True)))
+        rates[1:] += np.max([np.linalg.norm(h @ one.E, axis=0) for h, one in zip(rows, systems, strict=True)], axis=0)
         if of:
-            gains[name] = Gain(rates.start, (*rates.forced, 0.0, rates.forced[4]))
+            gains[name] = np.array([*rates, 0.0, rates[5]])
         else:
             plain = _gain([row @ flow for row, flow in zip(rows, flows, strict=True)], systems, s)
-            gains[name] = Gain(plain.start, (*plain.forced, rates.forced[4], 0.0))
+            gains[name] = np.array([*plain, rates[5], 0.0])
     eps, z = (max(float(np.linalg.norm(one.outputs[name] @ one.K)) for one in systems) for name in ("eps", "z"))
     return Responses(gains, eps, z)
 
 
-def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Gain:
-    """The gain of outputs h e^{As} at times s, of each axis. Shapes (steps, rows, n)."""
-    start = max(
-        float(np.linalg.norm(row @ one.M, 2, axis=(1, 2)).max()) for row, one in zip(rows, systems, strict=True)
-    )
+def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Floats:
+    """The gain of outputs h e^{As} at times s, of each axis, from a start and D₁ to D₅. Shape (6,)."""
+    start = max(np.linalg.norm(row @ one.M, 2, axis=(1, 2)).max() for row, one in zip(rows, systems, strict=True))
     forced = [np.linalg.norm(row @ one.E, axis=1) for row, one in zip(rows, systems, strict=True)]
-    areas = np.trapezoid(np.max(forced, axis=0), s, axis=0) * _SLACK
-    return Gain(start * _SLACK, tuple(map(float, areas)))
+    return np.append(start, np.trapezoid(np.max(forced, axis=0), s, axis=0)) * _SLACK
 
 
 def _flow(A: Floats, s: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""The loop in real time, as a user starts it, and bare Zenoh between two processes: rows for `__main__.py`.
+"""The loop in real time, as a user starts it: rows for `__main__.py`.
 
 Recorder, plant and controller run on TCP loopback for some seconds a turn. Its figures are computed from the turn's log
 and the plant's last status alone.
@@ -17,31 +17,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import numpy as np
-import zenoh
-
 from aeroloop.service.config import load
-from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, standalone
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
 
 PATIENCE_S: Final = 60.0
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
-NO_SCOUTING: Final = {"scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}}}
 AEROLOOP: Final = [sys.executable, "-Pm", "aeroloop"]
 
 
 class Turn(NamedTuple):
-    """Figures of one run. Times are in µs, memory in MB of 10⁶ bytes."""
+    """Figures of one run."""
 
     ticks: int
     in_time: int
     skipped: int
-    p50: float
-    p99: float
-    p999: float
-    longest: float
-    wake_p999: float
-    over_lockstep: float
-    memory_mb: float
+    latency_us: dict[str, float]
+    over_lockstep: float  # z_track
+    memory_mb: float  # of the largest process, of 10⁶ bytes
     notes: list[str]
 
 
@@ -63,23 +55,12 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
             processes.eventually("its end", lambda: not processes.running("controller"), seconds + PATIENCE_S)
             plant = processes.statuses["plant"]
         review = json.loads(run("log", "review", f"{folder}/log.mcap", "--json"))
-    trip, period_us = review["latency_us"], 1e6 / rate_hz
     broken = [f"{review['sessions']} sessions instead of one"] if review["sessions"] != 1 else []
-    assert plant.timing is not None
-    assert plant.timing.wake is not None
-    return Turn(
-        ticks=round(seconds * rate_hz) - 1,  # the last one ends the session
-        in_time=sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < period_us),
-        skipped=review["skipped_ticks"],
-        p50=trip["p50"],
-        p99=trip["p99"],
-        p999=trip["p999"],
-        longest=trip["max"],
-        wake_p999=plant.timing.wake.p999,
-        over_lockstep=review["z_track"] / z_track,
-        memory_mb=memory,
-        notes=[*broken, *plant.notes, *review["trips"], *review["damages"]],
-    )
+    in_time = sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < 1e6 / rate_hz)
+    ticks = round(seconds * rate_hz) - 1  # the last one ends the session
+    notes = [*broken, *plant.notes, *review["trips"], *review["damages"]]
+    over_lockstep = review["z_track"] / z_track
+    return Turn(ticks, in_time, review["skipped_ticks"], review["latency_us"], over_lockstep, memory, notes)
 
 
 def run(*words: str) -> str:
@@ -101,49 +82,3 @@ def cpu_s(pid: int) -> float:
     """CPU time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-# ── the floor: bare Zenoh between two processes at the loop's rate ──
-
-
-def bare_round_trips(seconds: float, rate_hz: float) -> np.ndarray:
-    """Round trips of 7 bytes there and 3 back [µs]."""
-    endpoint = free_rendezvous()
-    tree = {"listen": {"endpoints": [endpoint]}, **NO_SCOUTING}
-    echo = subprocess.Popen([sys.executable, "-m", "tests.benchmarks.loop", endpoint])
-    try:
-        with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-            answers = session.declare_subscriber("pong", zenoh.handlers.RingChannel(1))
-            ping = session.declare_publisher("ping")
-            while answers.try_recv() is None:  # until the other process is there
-                ping.put(bytes(7))
-                time.sleep(0.1)
-            trips = []
-            start = time.perf_counter()
-            for k in range(1, round(seconds * rate_hz)):
-                time.sleep(max(0.0, start + k / rate_hz - time.perf_counter()))
-                begun = time.perf_counter()
-                ping.put(bytes(7))
-                answers.recv()
-                trips.append(1e6 * (time.perf_counter() - begun))
-            return np.array(trips)
-    finally:
-        echo.terminate()
-        echo.wait()
-
-
-def answer(endpoint: str) -> None:
-    """Answer every ping."""
-    tree = {"connect": {"endpoints": [endpoint], "exit_on_failure": False}, **NO_SCOUTING}
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
-        pong, pings = (
-            session.declare_publisher("pong"),
-            session.declare_subscriber("ping", zenoh.handlers.RingChannel(1)),
-        )
-        while True:
-            pings.recv()
-            pong.put(bytes(3))
-
-
-if __name__ == "__main__":
-    answer(sys.argv[1])

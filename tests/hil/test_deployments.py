@@ -1,7 +1,6 @@
 """Deployments of the examples, each daemon on a host of its own: what the network's troubles cost, by the log.
 
-A watchdog of 0.5 s instead of 0.1 s allows for a busy machine, which must not trip the plant by itself. What is slower
-or longer, and with the examples' own settings, is measured by `tests/benchmarks/deployments.py`.
+A watchdog of 0.5 s instead of 0.1 s allows for a busy machine, which must not trip the plant by itself.
 """
 
 from __future__ import annotations

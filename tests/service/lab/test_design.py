@@ -47,8 +47,7 @@ def test_a_front_falls_in_bound_as_it_rises_in_payload_and_is_what_the_certifica
         assert point.degrees <= 3.5
         assert point.kbit_s == pytest.approx(payload(own))
         assert point.z_track is not None
-        assert point.on_change_kbit_s is not None
-        assert point.on_change_kbit_s < point.kbit_s
+        assert 0 < (point.on_change_kbit_s or 0) < point.kbit_s
 
 
 @pytest.mark.parametrize("bits", ["8/8/6", "9/6/5", "10/6/6", "9/9/4", "7/11/8", "12/12/12", "11/4/6"])
@@ -67,12 +66,11 @@ def test_delay_and_loss_move_the_front() -> None:
     assert plain.radius < late.radius
 
 
-def test_what_cannot_be_proven_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_prints_the_front_as_json_or_one_line_where_nothing_is_proven(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     assert execute(["lab", "design", "--error", "0.01", "--kbit", "40"]) == 1
     assert "is proven to stay within 0.01°" in capfd.readouterr().err
-
-
-def test_the_verb_prints_the_front_as_json(capfd: pytest.CaptureFixture[str]) -> None:
     words = ["--error", "4", "--kbit", "40", "--duration", str(SHORT), "--set", "law.damping_bound=0.0126", "--json"]
     assert execute(["lab", "design", *words]) == 0
     front = json.loads(capfd.readouterr().out)["front"]

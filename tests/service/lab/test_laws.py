@@ -10,7 +10,6 @@ import pytest
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.control.laws.baselines import response_of
 from aeroloop.service.lab.engine import figures_row, run_of
 from aeroloop.service.lab.laws import LAWS, compared_laws
 from aeroloop.service.lab.margins import WITHIN_DEG, Late, largest_error_deg, survived
@@ -30,25 +29,12 @@ def compared(settings: Settings, *laws: str) -> dict[str, Settings]:
     return {name: load_over(settings, overrides) for name, overrides in compared_laws(settings, laws).items()}
 
 
-def test_others_have_the_response_that_the_configured_gains_give_and_a_configured_law_stays_as_it_is() -> None:
-    C1, C2 = (0.5, 0.6, 0.7), (0.2, 0.1, 0.3)
-    own = load_over(SLOW, [f"law.C1={[*C1]}", f"law.C2={[*C2]}", "law.inertia=[0.02, 0.03, 0.04]"])
-    laws = {name: settings.law.model_dump() for name, settings in compared(own).items()}
-    assert laws["adaptive"] == own.law.model_dump()
-    wn, zeta = response_of((0.02, 0.03, 0.04), C1, C2)
-    for i, J in enumerate((0.02, 0.03, 0.04)):
-        assert laws["pd"]["kp"][i] == pytest.approx(2 * J * wn[i] ** 2, rel=1e-4)
-        assert laws["pd"]["kd"][i] == pytest.approx(2 * J * zeta[i] * wn[i], rel=1e-4)
-        assert (laws[f"adaptive{NO_GAMMA}"]["C1"][i], laws[f"adaptive{NO_GAMMA}"]["C2"][i]) == (C1[i], C2[i])
-    mine = load_over(SLOW, ["law.kind=pd", "law.kp=[1, 2, 3]"])
-    assert compared(mine, "pd")["pd"].law == mine.law
-
-
 @pytest.mark.parametrize("configured", ["adaptive", "adaptive-torque"])
 def test_without_adaptation_a_law_is_the_same_but_for_its_adaptation_gains(configured: str) -> None:
     """And what is known of the damping is the same for all laws, so that their bounds compare."""
     own = load_over(SLOW, [f"law.kind={configured}", "law.damping_bound=0.02", "law.damping_estimate=[0, 0.01, 0.02]"])
     found = compared(own)
+    assert found[configured].law == own.law
     assert set(found) == {*LAWS, "adaptive, Γ = 0", "adaptive-torque, Γ = 0"}
     laws = {name: settings.law.model_dump() for name, settings in found.items()}
     for law in laws.values():
@@ -103,16 +89,9 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
 def test_what_a_law_survives_is_the_last_step_before_the_bound() -> None:
     found = survived(PD, S)
     ticks, frames = round(found["delay_ms"] / 10), found["lost_frames"]
-    assert ticks > 0
-    assert frames > 0
+    assert min(ticks, frames) > 0
     for kept, too_late in (((ticks, 0), (ticks + 1, 0)), ((0, frames), (0, frames + 1))):
-        errors = [largest_error_deg(PD, S, *late) for late in (kept, too_late)]
-        assert errors[0] <= WITHIN_DEG < errors[1]
-
-
-def test_a_law_that_runs_away_survives_nothing() -> None:
-    runaway = load(overrides=["loop.rate_hz=100", f"law.kind={FAILING}:Runaway"])
-    assert survived(runaway, S) == {"delay_ms": None, "lost_frames": None}
+        assert largest_error_deg(PD, S, *kept) <= WITHIN_DEG < largest_error_deg(PD, S, *too_late)
 
 
 class Recording(EmulatedPlant):

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -22,7 +21,7 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.axes import configurations, parse_axes
 from aeroloop.service.lab.engine import Run, SweepError, code_version, open_workers, run_of
-from aeroloop.service.lab.sweep import Sweep, SweepPlan, run_sweep
+from aeroloop.service.lab.sweep import SweepPlan, run_sweep
 from tests.support.in_this_process import run_here, workers_here
 
 pytestmark = pytest.mark.processes
@@ -102,41 +101,26 @@ def end(_settings: Settings) -> None:
     os._exit(1)
 
 
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[LocalCluster]:
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
-        yield cluster
-
-
-def swept(cluster: LocalCluster, out: Path, kill: int | None = None) -> Sweep:
-    """The sweep on the cluster, of which one worker is killed once four experiments are done."""
-
-    def progress(done: int, _total: int) -> None:
-        if done == 4 and kill is not None:
-            os.kill(kill, signal.SIGKILL)
-
-    return run_sweep(planned(), out, engine=f"dask:{cluster.scheduler_address}", progress=progress)
-
-
 @pytest.mark.realtime  # a cluster of Dask's own processes
-def test_a_worker_of_a_cluster_that_is_killed_midway_costs_no_row_and_no_bit(
-    cluster: LocalCluster, local: bytes, tmp_path: Path
+def test_a_worker_that_is_killed_costs_no_row_and_no_bit_and_one_with_other_code_ends_the_sweep(
+    local: bytes, tmp_path: Path
 ) -> None:
-    out = tmp_path / "a.parquet"
-    result = swept(cluster, out, kill=next(iter(cluster.workers.values())).pid)
-    assert (result.done, result.resumed, result.failed) == (2 * SEEDS, 0, 0)
-    assert out.read_bytes() == local
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+        out, other, engine = tmp_path / "a.parquet", tmp_path / "b.parquet", f"dask:{cluster.scheduler_address}"
+        pid = next(iter(cluster.workers.values())).pid
 
+        def progress(done: int, _total: int) -> None:
+            if done == 4:
+                os.kill(pid, signal.SIGKILL)
 
-@pytest.mark.realtime  # a cluster of Dask's own processes
-def test_workers_with_other_code_end_the_sweep_in_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
-    name = "from aeroloop.service.lab import engine as w; w.code_version ="
-    with Client(cluster.scheduler_address, set_as_default=False) as client:
-        client.run(exec, f"{name} lambda: '0.2.0+other'", {})
+        result = run_sweep(planned(), out, engine=engine, progress=progress)
+        assert (result.done, result.resumed, result.failed) == (2 * SEEDS, 0, 0)
+        assert out.read_bytes() == local
+        with Client(cluster.scheduler_address, set_as_default=False) as client:
+            client.run(exec, "from aeroloop.service.lab import engine as w; w.code_version = lambda: '0.2.0+other'", {})
         with pytest.raises(SweepError, match=rf"runs aeroloop 0\.2\.0\+other, this machine {code_version()[:5]}"):
-            swept(cluster, tmp_path / "a.parquet")
-        client.run(exec, f"{name} lambda: {code_version()!r}", {})
-    assert not (tmp_path / "a.parquet").exists()
+            run_sweep(planned(), other, engine=engine)
+        assert not other.exists()
 
 
 @pytest.mark.realtime  # a cluster of Dask's own processes

@@ -21,7 +21,8 @@ from aeroloop.service.review.review import read
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem, judged_ticks
 from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
-from aeroloop.service.theorem.invariant import Premises, Reach, reach
+from aeroloop.service.theorem.invariant import Reach, reach
+from aeroloop.service.theorem.premises import Premises
 from tests.support.certified import FREE, bits
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
 from tests.support.ideal import IDEAL

@@ -8,7 +8,7 @@ import numpy as np
 
 from aeroloop.plant_emulator.model.emulated import rate_of
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.theorem.plant_bounds import PlantBounds, plant_bounds
+from aeroloop.service.theorem.premises import PlantBounds, plant_bounds
 
 
 def of(*changes: str) -> PlantBounds:
