@@ -18,13 +18,10 @@ from aeroloop.service.cli.common import (
     Json,
     Markdown,
     Overrides,
-    check_figure,
     checked,
-    loop_of,
-    new_file,
+    load_for_loop,
     report,
     show,
-    with_bits_of,
     working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
@@ -48,7 +45,7 @@ def experiment(
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, without a network."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.log_sheets import figure_sheets
 
@@ -65,7 +62,7 @@ def tables(
     overrides: Overrides = None,
 ) -> None:
     """Predict the paper's Tables C.2 to C.4. Beside the published values."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.tables import predict, sheets
 
     with working("cells", json) as update:
@@ -75,7 +72,7 @@ def tables(
 
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.tables import calibrate, calibration_sheets
 
     with working("experiments", json) as update:
@@ -95,11 +92,11 @@ def certify(
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.theorem import certificate
+    from aeroloop.service.theorem.certificate import certify
 
-    result = certificate.certify(settings, disturbance=disturbance)
+    result = certify(settings, disturbance=disturbance)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 
@@ -129,17 +126,22 @@ def burden(
     overrides: Overrides = None,
 ) -> None:
     """Measure error against bits, for every quantizer and sensor. Sent on change and at every tick."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
+    from aeroloop.service.logs.outputs import check_output, writing
 
     with checked():
-        check_figure(figure, config, force)
+        if figure is not None:
+            from aeroloop.service.report.figure_style import check_path
+
+            check_path(figure)
+            check_output(figure, [config], force=force)
         cells = grid(settings, bits or (), quantizer or ())
     with working("experiments", json) as update:
         result = measure_burden(settings, cells, duration, update, engine)
     show(result, json, sheets, markdown, keys=2)
-    if figure is not None:
-        with new_file(figure, config, force) as part:
+    if figure is not None:  # after the table: a full disk must not cost it
+        with writing(figure, [config], force=force) as part:
             draw_burden(result, part)
 
 
@@ -162,11 +164,10 @@ def laws(
     overrides: Overrides = None,
 ) -> None:
     """Compare control laws, tuned alike. Proven bound, error, effort, chatter, bits, delay and loss survived."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.laws import compare, compared_laws, sheets
 
-    with checked():
-        compared = compared_laws(settings, law or ())
+    compared = compared_laws(settings, law or ())
     with working("experiments and searches", json) as update:
         result = compare(settings, compared, seeds=seeds, duration_s=duration, engine=engine, progress=update)
     show(result, json, sheets, markdown)
@@ -193,13 +194,13 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds. Writes a table of their figures."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, rows_file, run_sweep, sheets
 
+    axes = parse_axes(vary or ())
+    planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
     with checked():
-        axes = parse_axes(vary or ())
-        planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
         check_table(out, [config], force=force)
     with working("experiments", json) as update:
         try:
@@ -236,20 +237,20 @@ def tune(
     What is minimised is the mean of z_track + 1e-7·u_total, by one factor for each gain, up to 10 either way. Gains
     with which a run trips, or a voltage changes over 1.25 times as often as with the configured ones, do not count.
     """
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.engine import open_workers
     from aeroloop.service.lab.tune import TuneOptions, sheets, toml_of, tune
-    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.logs.outputs import check_output, writing
 
-    with checked():
-        if out is not None:
+    if out is not None:
+        with checked():
             check_output(out, [config], force=force)
     options = TuneOptions(gain or (), seeds, held_out, budget, duration)
     with working("experiments", json) as update, open_workers(engine) as workers:
         found = tune(settings, options, workers, update)
     show(found, json, sheets)
     if out is not None:
-        with new_file(out, config, force) as part:
+        with writing(out, [config], force=force) as part:
             part.write_text(toml_of(found), encoding="utf-8")
     raise typer.Exit(INTERRUPTED if found.interrupted else int(found.worse))
 
@@ -274,7 +275,7 @@ def design(
     overrides: Overrides = None,
 ) -> None:
     """Search bits and rate for the least payload. Its attitude error is proven."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab import design as lab
 
     with working("experiments", json) as update:

@@ -63,7 +63,8 @@ def execute(arguments: Sequence[str]) -> int:
             raise
         if isinstance(error, AeroloopError | ValueError):
             report(str(error).splitlines()[0])
-        elif isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
+            return getattr(error, "exit_code", 1)
+        if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
             report(f"this needs {error.name}, which is not installed: pip install 'aeroloop[{extra}]'")
         else:
             text = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Overrides, checked, fail, loop_of, settings_of
+from aeroloop.service.cli.common import Config, Overrides, checked, fail, load_for_loop, load_settings
 
 if TYPE_CHECKING:
     from aeroloop.service.config import Settings
@@ -33,10 +32,10 @@ def show_config(
     from aeroloop.service.config import with_law_settings
 
     if check:
-        _check(loop_of(config, overrides))
+        _check(load_for_loop(config, overrides))
         return
-    settings = settings_of(config, overrides)
-    with checked(), suppress(PluginError):  # a class that is not on this host: its keys as they are written
+    settings = load_settings(config, overrides)
+    with suppress(PluginError):  # a class that is not on this host: its keys as they are written
         settings = with_law_settings(settings)
     typer.echo(settings.toml(comments=True), nl=False)
 
@@ -54,42 +53,18 @@ def _check(settings: Settings) -> None:
 
 
 @group.command()
-def api() -> None:
-    """List the names of the Python package, with arguments or fields."""
-    from aeroloop import research
-
-    for name in research.__all__:
-        value = getattr(research, name)
-        if inspect.isclass(value) or inspect.isfunction(value):
-            sentence = (inspect.getdoc(value) or "").partition("\n")[0]
-            typer.echo(f"{name}{_signature(value)}\n    {sentence}")
-        else:
-            typer.echo(f"{name}\n    A type, for the fields of a law's settings.")
-
-
-def _signature(value: Any) -> str:
-    """Arguments of a function or a class; of a model or a named tuple its fields."""
-    if fields := getattr(value, "model_fields", None) or getattr(value, "_fields", None):
-        return f"({', '.join(fields)})"
-    try:
-        return str(inspect.signature(value)).replace("'", "").removesuffix(" -> None")
-    except ValueError:  # of a built-in base
-        return ""
-
-
-@group.command()
 def spec(config: Config = None, overrides: Overrides = None) -> None:
     """Print the configured wire: frames, widths and quantizer steps."""
     from aeroloop.service.terminal.sheets import wire_sheets
     from aeroloop.service.terminal.show import show_all
 
-    show_all(wire_sheets(settings_of(config, overrides).wire))
+    show_all(wire_sheets(load_settings(config, overrides).wire))
 
 
 @group.command()
 def dbc(config: Config = None, overrides: Overrides = None) -> None:
     """Print the DBC file of the configured wire and CAN node."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
 
     from aeroloop.service.viewers.dbc import dbc as describe
 
@@ -101,7 +76,7 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def layout(config: Config = None, overrides: Overrides = None) -> None:
     """Print a layout for Foxglove or Lichtblick. It shows a log or `log live`."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
 
     from aeroloop.service.viewers.schemas import layout as describe
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -16,17 +15,16 @@ from aeroloop.service.terminal.show import Row, Sheets
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
     from aeroloop.service.lab.demo import DemoFigures
+    from aeroloop.service.logs.copies import Recovery
+    from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.replay import EndReplay, Replay
 
-MARKS_SHOWN: Final = 12
-"""Events that do not matter."""
 BEFORE: Final = "before"
 """In place of its time, of what happened before the session."""
 BEFORE_SHOWN: Final = 4
-DISAGREEMENTS_SHOWN: Final = 5
-SESSIONS_SHOWN: Final = 9
-DAMAGES_SHOWN: Final = 20
-UNSEEN_SHOWN: Final = 3
+"""Events of no matter from before the session."""
+SHOWN: Final = 12
+"""Lines of one kind; `--json` has them all."""
 
 LAPSES: Final = {
     "late": "late measurements", "malformed": "malformed measurements", "stale": "stale commands",
@@ -63,19 +61,18 @@ def review_sheets(findings: Findings) -> Sheets:
     if findings.faults:
         yield "with faults", [_fault(fault) for fault in findings.faults]
     yield "", _one_run(findings)
-    durations: list[Row] = []
-    for each in rows.durations([findings]):
-        percentiles = dict(zip(rows.PERCENTILES.values(), each.percentiles, strict=True))
-        durations.append({"": each.label, **percentiles})
-    if durations:
-        yield "", durations
+    if durations := rows.durations([findings]):
+        names = rows.PERCENTILES.values()
+        yield "", [{"": each.label, **dict(zip(names, each.percentiles, strict=True))} for each in durations]
     yield "", [{"of the log": label, "found": text} for label, text in _details(findings)]
     if findings.theorem is not None:
-        signs = {True: "✓", False: "✗", None: ""}
+        signs = {True: "✓", False: "✗", None: "–"}
         yield "", [{"": signs[good], "theorem": text} for good, text in rows.theorem_sentences(findings)]
-    others = [entry for entry in since if not grave(entry[1])]
-    if before or others:
-        yield "", _other_events(before, others)
+    others = [*before[-BEFORE_SHOWN:], *(entry for entry in since if not grave(entry[1]))]
+    if others:
+        more = max(0, len(before) - BEFORE_SHOWN) + max(0, len(others) - SHOWN)
+        shown = [_event(when, mark.role, mark.kind, mark.text) for when, mark in others[:SHOWN]]
+        yield "", shown + [_event("", "", "", f"… and {more} more such events; --json has them all")] * (more > 0)
     if findings.checks:
         checks = findings.checks
         yield "", [{"": "✓" if each.holds else "✗", "required": each.text, "found": each.found} for each in checks]
@@ -134,10 +131,10 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
             yield f"invalid {name}s", str(n)
     if findings.lapses:
         yield "frames and ticks", ", ".join(f"{LAPSES[name]}: {n:,}" for name, n in findings.lapses.items())
-    for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
-        yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
-    if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
-        yield "", f"… and {more} more keys; --json has them all"
+    for line in _some(
+        [f"{each.key}: controller {each.controller}, plant {each.plant}" for each in findings.disagreements]
+    ):
+        yield "ends disagree", line
     if findings.log:
         yield "path", findings.log
     if (part := findings.reasons.get("duration_s")) is not None:
@@ -150,7 +147,7 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
     its = [one for one in findings.recorded if one.vehicle == findings.vehicle]
     if len(its) > 1:
         listed = [f"{i} is {one.session}, {one.duration_s:.1f} s" for i, one in enumerate(its, 1)]
-        yield "sessions", f"{'; '.join(_some(listed, SESSIONS_SHOWN))}; --session N shows another"
+        yield "sessions", f"{'; '.join(_some(listed))}; --session N shows another"
 
 
 def _fault(fault: FaultInterval) -> Row:
@@ -189,22 +186,28 @@ def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
     return found
 
 
-def _other_events(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, Mark]]) -> list[Row]:
-    """Events that do not matter, after the last few from before the session; earlier ones are counted in one row."""
-    found = []
-    if earlier := Counter(mark.kind for _, mark in before[:-BEFORE_SHOWN]):
-        counts = ", ".join(f"{n} {kind}" for kind, n in earlier.items())
-        found.append(_event(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all"))
-    shown = [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]
-    found += [_event(when, mark.role, mark.kind, mark.text) for when, mark in shown]
-    if (more := len(marks) - MARKS_SHOWN) > 0:
-        found.append(_event("", "", "", f"… and {more} more such events; --json has them all"))
-    return found
+def _some(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - SHOWN
+    return [*lines[:SHOWN], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
-def _some(lines: Sequence[str], shown: int = DAMAGES_SHOWN) -> list[str]:
-    more = len(lines) - shown
-    return [*lines[:shown], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
+def recovery_sheets(recovery: Recovery) -> Sheets:
+    """What was recovered, and a line for each part that was not."""
+    found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"
+    yield "\n".join([found, *(f"not recovered, {line}" for line in recovery.lost)]), []
+
+
+def export_sheets(exported: Exported) -> Sheets:
+    """What was exported, and what of the log was not."""
+    if exported.sessions is None:
+        found = f"{exported.rows} messages on {len(exported.columns)} channels"
+    else:
+        found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
+    lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
+    if others := exported.left_out:
+        names = ", ".join(_some(others))
+        lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
+    yield "\n".join([f"{exported.out}: {found}", *lines]), []
 
 
 def replay_sheets(replay: Replay) -> Sheets:
@@ -255,10 +258,10 @@ def _replayed(replay: Replay, name: End) -> str:
     else:
         found = f"{end.ticks} ticks, every tick is the same, byte for byte"
     if unseen:
-        found += f"; not compared: {'; '.join(_some(unseen, UNSEEN_SHOWN))}"
+        found += f"; not compared: {'; '.join(_some(unseen))}"
     if end is None:
         return found
     if reason and not unseen:
         found += f"; {reason}"
     open_ended = [gap for gap in replay.missing if gap.end == name and not gap.rows]
-    return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:UNSEEN_SHOWN])
+    return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:SHOWN])

@@ -5,12 +5,12 @@ What is silent is marked with the age of its last status.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.protocol.transport.certificate import SOON_DAYS
-from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
+from aeroloop.service.host.health import NEEDED, SILENT_S, Trouble
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.show import Row, Sheets
 
@@ -29,9 +29,9 @@ def status_sheets(found: Gathered) -> Sheets:
         yield from role_sheets({role: (status.age_s, status) for role, status in roles.items()}, vehicle)
 
 
-def trouble_sheets(found: Gathered) -> Sheets:
+def trouble_sheets(found: Gathered, wrong: Sequence[Trouble]) -> Sheets:
     """A line for each trouble; without any, one for each vehicle."""
-    lines = [trouble.text for trouble in troubles(found)]
+    lines = [trouble.text for trouble in wrong]
     for vehicle, roles in sorted(found.statuses.items()) if not lines else []:
         states = ", ".join(f"{role} {status.state}" for role, status in sorted(roles.items()))
         lines.append(f"{vehicle} is well: {states}")

@@ -275,7 +275,9 @@ class ProcessGroup:
             if child.exitcode and role not in self._killed:
                 lines = self._output(role).read_text(errors="replace").strip().splitlines()
                 last = next((f": {line}" for line in reversed(lines) if " INFO " not in line), "")
-                raise HilError(f"the {role} ended with exit code {child.exitcode}{last}")
+                failure = HilError(f"the {role} ended with exit code {child.exitcode}{last}")
+                failure.exit_code = 2 if child.exitcode == 2 else 1  # its configuration is wrong
+                raise failure
 
     def _output(self, role: str) -> Path:
         return self._folder / f"{role}.txt"

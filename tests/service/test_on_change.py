@@ -12,7 +12,7 @@ from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service import examples
-from aeroloop.service.config import ConfigError, Settings, load, with_bits
+from aeroloop.service.config import ConfigError, Settings, bits_overrides, load, load_over
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.figures import Figures
@@ -45,7 +45,7 @@ def cost_aside(figures: Figures) -> Figures:
 def test_in_lockstep_the_figures_are_those_of_a_frame_every_tick(
     loop: str, bits: str, measurement: Policy, command: Policy
 ) -> None:
-    settings = with_bits(LOOPS[loop], bits)
+    settings = load_over(LOOPS[loop], bits_overrides(bits))
     periodic = run_experiment(settings, DURATION)
     sparse = run_experiment(sending(settings, measurement, command), DURATION)
     assert cost_aside(sparse) == cost_aside(periodic)

@@ -16,7 +16,7 @@ import pytest
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
-from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.config import Settings, bits_overrides, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from tests.support import numpy_twin as twin
@@ -99,7 +99,7 @@ class Run(NamedTuple):
 
 def run_from(bits: str, q: Array, omega: Array, first_tick: int, seconds: float) -> Run:
     """The closed loop in lockstep, through real frames, with the body at an attitude and rate at the start."""
-    settings = with_bits(OTHER, f"{bits}/{bits}")
+    settings = load_over(OTHER, bits_overrides(f"{bits}/{bits}"))
     loop, wire, given = settings.loop, settings.wire, settings.plant
     body = given.rigid_body.model_validate(
         given.rigid_body.model_dump() | {"attitude": q.tolist(), "rate": omega.tolist()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.config import Settings, bits_overrides, load, load_over
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
 from tests.support.ideal import IDEAL
@@ -18,7 +18,7 @@ DURATION = 50.0
 
 @pytest.fixture(scope="module")
 def unquantized() -> Figures:
-    return run_experiment(with_bits(IDEAL_AERO, "cont/cont"), DURATION)
+    return run_experiment(load_over(IDEAL_AERO, bits_overrides("cont/cont")), DURATION)
 
 
 def _score(figures: Figures) -> tuple[float, float]:
@@ -53,7 +53,9 @@ def test_coarser_outputs_raise_z_track_by_what_quantization_puts_into_the_error(
     eta = np.array([paper.desired(t)[0][0] for t in times])
     step = 2 / (2**bits - 1)
     expected = DURATION * np.mean(step**2 / 12 * (3 + (1 - eta**2) / eta**2))
-    rise = _score(run_experiment(with_bits(IDEAL_AERO, f"{bits}/6"), DURATION))[0] - _score(unquantized)[0]
+    rise = (
+        _score(run_experiment(load_over(IDEAL_AERO, bits_overrides(f"{bits}/6")), DURATION))[0] - _score(unquantized)[0]
+    )
     # Even spread needs a path across many steps: at 8 bits ε₁ and ε₂ cross some 30 steps to and fro, and rest at their
     # crests, which is good for a tenth either way. Quantized rates and voltages shake the body itself a little.
     assert 0.9 * expected < rise < 1.15 * expected
