@@ -33,8 +33,7 @@ def doctor(
     from aeroloop.service.terminal.sheets import diagnosis_sheets
 
     with working("check", json, CHECK_S) as update:
-        tried = settings.network if network else None
-        diagnosis = diagnose(settings.loop, update, settings.network.security.folder, tried)
+        diagnosis = diagnose(settings.loop, settings.network, update, handshakes=network)
     show(diagnosis, json, diagnosis_sheets, keys=2)
     if not diagnosis.holds:
         raise typer.Exit(1)

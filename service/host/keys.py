@@ -116,39 +116,35 @@ def show(directory: Path) -> list[KeyFile]:
         CertificateError: The directory has no authority.
     """
     ca = load(directory / AUTHORITY)
-    days_left = (ca.not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86400
-    authority = KeyFile(
-        file=AUTHORITY,
-        role="authority",
-        name=subject_field(ca, "CN"),
-        valid_until=ca.not_valid_after_utc,
-        days_left=days_left,
-        fingerprint=ca.fingerprint(SHA256()).hex(),
-        problem=EXPIRED.format(directory / AUTHORITY) if days_left < 0 else None,
-    )
+    expired = EXPIRED.format(directory / AUTHORITY) if ca.not_valid_after_utc < datetime.now(UTC) else None
     named = (file for file in sorted(directory.glob("*.pem")) if file.stem.partition(".")[0] in ROLES)
-    return [authority, *map(_shown, named)]
+    return [_row(ca, AUTHORITY, "authority", None, subject_field(ca, "CN"), expired), *map(_shown, named)]
 
 
 def _shown(file: Path) -> KeyFile:
     role, _, vehicle = file.stem.partition(".")
+    problem = None
     try:
         found = read_certificate(file)
     except CertificateError as error:
         return KeyFile(file=file.name, problem=str(error))
-    problem = None
     try:
         check(file, role, vehicle or None)
     except CertificateError as error:
         problem = str(error)
+    return _row(found.x509, file.name, found.role, found.vehicle, found.name, problem)
+
+
+def _row(made: x509.Certificate, file: str, role: str, vehicle: str | None, name: str, problem: str | None) -> KeyFile:
+    until = made.not_valid_after_utc
     return KeyFile(
-        file=file.name,
-        role=found.role,
-        vehicle=found.vehicle,
-        name=found.name,
-        valid_until=found.not_after,
-        days_left=found.days_left,
-        fingerprint=found.x509.fingerprint(SHA256()).hex(),
+        file=file,
+        role=role,
+        vehicle=vehicle,
+        name=name,
+        valid_until=until,
+        days_left=(until - datetime.now(UTC)).total_seconds() / 86400,
+        fingerprint=made.fingerprint(SHA256()).hex(),
         problem=problem,
     )
 
@@ -170,14 +166,9 @@ def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
 
 
 def _signed(
-    secret: EllipticCurvePrivateKey,
-    issuer: x509.Name,
-    subject: x509.Name,
-    public: EllipticCurvePublicKey,
-    until: datetime,
-    *,
-    authority: bool = False,
-) -> x509.Certificate:
+    secret: EllipticCurvePrivateKey, issuer: x509.Name, subject: x509.Name, public: EllipticCurvePublicKey,
+    until: datetime, *, authority: bool = False,
+) -> x509.Certificate:  # fmt: skip
     uses = dict.fromkeys(signature(x509.KeyUsage).parameters, False)
     uses["key_cert_sign" if authority else "digital_signature"] = True
     begin = datetime.now(UTC) - _EARLIER
@@ -209,11 +200,8 @@ def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticC
     for path in (file, secret):
         if os.path.lexists(path):
             raise CertificateError(f"{path} exists, and is not overwritten: move it away first")
-    contents = {
-        secret: (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600),
-        file: (made.public_bytes(Encoding.PEM), 0o644),
-    }
-    for path, (content, mode) in contents.items():
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    for path, content, mode in ((secret, pem, 0o600), (file, made.public_bytes(Encoding.PEM), 0o644)):
         try:
             with open(path, "xb", opener=partial(os.open, mode=mode)) as out:
                 out.write(content)

@@ -54,7 +54,7 @@ def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) ->
         return wait(grid)
 
     monkeypatch.setattr(TickGrid, "wait", stalling)
-    diagnosis = doctor.diagnose(LoopSettings(rate_hz=100.0))
+    diagnosis = doctor.diagnose(LoopSettings(rate_hz=100.0), NetworkSettings())
     assert not diagnosis.holds
     assert diagnosis.skipped > 0
     assert not diagnosis.findings[-1].good

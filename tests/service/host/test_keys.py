@@ -13,10 +13,15 @@ import pytest
 
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.transport.certificate import CertificateError, load, own_certificate, read_certificate
+from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host import keys
 from aeroloop.service.host.doctor import certificate_findings
 from tests.support.certificates import DAY, Authority, common_name
+
+
+def of(folder: Path) -> NetworkSettings:
+    return NetworkSettings(security=SecuritySettings(directory=str(folder)))
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -101,7 +106,7 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     authority = Authority(tmp_path / "keys", days=100)
     authority.issue("plant", "aero", ends=50 * DAY)
     authority.issue("operator", ends=13 * DAY)
-    findings = {finding.what: finding for finding in certificate_findings(authority.folder)}
+    findings = {finding.what: finding for finding in certificate_findings(of(authority.folder))}
     assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
     assert "13 days left" in findings["operator.pem"].found
     assert "keys issue" in findings["operator.pem"].advice
@@ -113,8 +118,8 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     assert "expired" in rows["observer.pem"]["problem"]
     assert rows["plant.aero.pem"]["problem"] is None
     assert 49 < rows["plant.aero.pem"]["days_left"] < 51
-    assert not {finding.what: finding for finding in certificate_findings(authority.folder)}["observer.pem"].good
-    (missing,) = certificate_findings(tmp_path)
+    assert not {finding.what: finding for finding in certificate_findings(of(authority.folder))}["observer.pem"].good
+    (missing,) = certificate_findings(of(tmp_path))
     assert not missing.good
     monkeypatch.setenv("COLUMNS", "120")
     assert run([*words[:3], *words[4:]]) == 1
