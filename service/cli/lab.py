@@ -83,7 +83,7 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
 def certify(
     disturbance: Annotated[
         float | None,
-        typer.Option(min=0, help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it."),
+        typer.Option(min=0, help="Largest torque beyond the plant's settings, in N·m; a machine needs it."),
     ] = None,
     bits: BitsOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
@@ -103,17 +103,13 @@ def certify(
 
 def burden(
     bits: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; may be repeated; six pairs if left out."
-        ),
+        list[str] | None, typer.Option(metavar="OUT/IN", help="Such as 8/6; may be repeated; six pairs if left out.")
     ] = None,
     quantizer: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KIND",
             help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
-            "the rest); may be repeated; all four if left out.",
+            "the rest); may be repeated; all four if left out."
         ),
     ] = None,
     duration: Duration = PAPER_DURATION_S,
@@ -148,11 +144,7 @@ def burden(
 def laws(
     law: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KIND",
-            help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out. "
-            "One that adapts is shown without adaptation, too.",
-        ),
+        typer.Option(help="A law.kind; may be repeated; ours if left out. One that adapts is shown without that, too."),
     ] = None,
     seeds: _Seeds = 5,
     duration: Duration = PAPER_DURATION_S,
@@ -179,9 +171,8 @@ def sweep(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
-            help="section.key=a,b,c, also of lists: law.C2=[1,1,1],[2,2,2]; or section.key=a..b*n, n values evenly "
-            "from a to b; section.key*=VALUES has factors of what is configured: law.C2*=0.5,1,2. May be repeated, "
-            "for every combination.",
+            help="section.key=a,b,c, or a..b*n, n values evenly from a to b; section.key*=VALUES has factors of what "
+            "is configured: law.C2*=0.5,1,2. May be repeated, for every combination.",
         ),
     ] = None,
     seeds: _Seeds = 1,
@@ -214,15 +205,10 @@ def sweep(
 def tune(
     gain: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Gain, or other number of the law's settings; may be repeated; all of the law's gains if left out.",
-        ),
+        typer.Option(help="Gain, or other number of [law]; may be repeated; all of the law's gains if left out."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds, each calm and in wind.")] = 2,
-    held_out: Annotated[
-        int, typer.Option(min=1, max=100, help="Runs with other seeds and winds, which the search does not see.")
-    ] = 4,
+    held_out: Annotated[int, typer.Option(min=1, max=100, help="Runs with seeds and winds not searched.")] = 4,
     budget: Annotated[int, typer.Option(min=1, help="Experiments of the search, at most.")] = 1000,
     duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 10.0,
     out: Annotated[Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.")] = None,
@@ -257,13 +243,9 @@ def tune(
 
 def design(
     error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
-    kbit: Annotated[
-        float | None,
-        typer.Option(min=0, metavar="KBIT", help="Largest payload of both frames, in kbit/s."),
-    ] = None,
+    kbit: Annotated[float | None, typer.Option(min=0, help="Largest payload of both frames, in kbit/s.")] = None,
     rates: Annotated[
-        list[float] | None,
-        typer.Option("--rate", metavar="HZ", help="Rate; may be repeated; as configured if left out."),
+        list[float] | None, typer.Option("--rate", help="Rate, in Hz; may be repeated; as configured if left out.")
     ] = None,
     delay: Annotated[float, typer.Option(min=0, metavar="S", help="Further delay of every command, in s.")] = 0.0,
     loss: Annotated[int, typer.Option(min=0, metavar="N", help="Most frames lost in a row.")] = 0,

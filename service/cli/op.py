@@ -43,10 +43,8 @@ def status(
         bool,
         typer.Option(
             "--check",
-            help="Print only what is wrong, and exit with 1 if anything is: a plant tripped or a controller faulted; a "
-            "role silent for 3 s; a loop late (over 1 % of the last 10 s' ticks skipped, or commands that take over a "
-            "period at the 99th percentile); a controller or plant missing, or a recorder that was there or is "
-            "required; messages that a recorder lost; a plant that cannot keep a stop on disk.",
+            help="Print only what is wrong, and exit with 1 if anything is: tripped, faulted, silent for 3 s, missing, "
+            "late (1 % of ticks skipped, or commands over a period at p99), messages lost, a stop not kept on disk.",
         ),
     ] = False,
     json: Json = False,

@@ -42,19 +42,13 @@ def progress_bar(title: str, total: float | None = None, *, hidden: bool = False
 
 
 def demo_progress(settings: Settings, update: Callable[..., None]) -> Callable[[str, ProcessGroup], None]:
-    """Update a bar with what the demo waits for, and from the first command on with the loop's values of now."""
+    """Update a bar with what the demo waits for, and from the first command on with time and error."""
 
     def show(waiting_for: str, now: ProcessGroup) -> None:
         if waiting_for or now.telemetry is None:
-            states = f" ({now.states})" if now.states and now.telemetry is None else ""
-            update(title=f"waiting for {waiting_for}{states}")
-            return
-        values = [
-            f"error {degrees(angle(*now.telemetry.attitude_error)):5.2f}°",
-            f"{' '.join(f'{u:+5.1f}' for u in now.telemetry.voltages)} V",
-        ]
-        if "controller" in now.statuses:
-            values.append(f"{sum(status.skipped for status in now.statuses.values())} skipped")
-        update(now.telemetry.tick * settings.loop.period, title=", ".join(values))
+            update(title=f"waiting for {waiting_for}")
+        else:
+            error = degrees(angle(*now.telemetry.attitude_error))
+            update(now.telemetry.tick * settings.loop.period, title=f"error {error:5.2f}°")
 
     return show
