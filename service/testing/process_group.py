@@ -167,13 +167,14 @@ class ProcessGroup:
         self._folder.mkdir(parents=True, exist_ok=True)
         # A stop or a trip outlives its process here, and surprises no other group.
         plant = settings.plant.model_copy(update={"state_directory": self._folder.absolute() / "state"})
-        self._settings = settings = settings.model_copy(update={"plant": plant})
+        self.settings = settings = settings.model_copy(update={"plant": plant})
         self._config = self._folder / "aeroloop.toml"
         self._config.write_text(settings.toml())
         self._children: dict[str, BaseProcess] = {}
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = Condition()
+        self.closed = False
         self.statuses: dict[str, Status] = {}
         self.events: list[Event] = []
         self.telemetry: Telemetry | None = None
@@ -186,11 +187,17 @@ class ProcessGroup:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for role in get_args(RoleName):
-            if role in self._children:
-                self.stop(role)
-        self.zenoh.close()
-        self._cleanup.close()
+        self.close()
+
+    def close(self) -> None:
+        """Stop all processes; a second call does nothing."""
+        if not self.closed:
+            self.closed = True
+            for role in get_args(RoleName):
+                if role in self._children:
+                    self.stop(role)
+            self.zenoh.close()
+            self._cleanup.close()
 
     def start_loop(self, *, drive: bool = True, environment: Mapping[str, str] | None = None) -> None:
         """Start recorder, plant end, a node on a bus that is software, and a controller; wait for recorder and plant.
@@ -200,7 +207,7 @@ class ProcessGroup:
             environment: As of `start_command`.
         """
         roles: list[RoleName] = ["recorder", "plant"]
-        if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
+        if self.settings.plant.via == "can" and self.settings.can.interface == "udp_multicast":
             roles.insert(1, "can-node")
         if drive:
             roles.append("controller")
@@ -227,11 +234,9 @@ class ProcessGroup:
             while not condition():
                 self.check()
                 if time.monotonic() > deadline:
-                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
-                    raise HilError(
-                        f"not within {timeout_s:g} s: {what} ({self.states or 'no status was received'}"
-                        f"{f'; last events: {last}' if last else ''})"
-                    )
+                    last = [f"; {event.role} {event.kind}: {event.text}" for event in self.events[-3:]]
+                    states = self.states or "no status was received"
+                    raise HilError(f"not within {timeout_s:g} s: {what} ({states}{''.join(last)})")
                 self._changed.wait(0.05)
 
     @property
