@@ -11,21 +11,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings, counter_fills_frame
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
-from aeroloop.protocol.wording import keys, problems
+from aeroloop.protocol.wording import keys
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import Target, merged, read_sources, tree_of, valid
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import CustomLawSettings, LawError, LawSection, law_settings
-from aeroloop.service.settings import ControllerSettings, PointsError, RecorderSettings, read_points
+from aeroloop.service.settings import ControllerSettings, RecorderSettings, read_points
 
 
 class PointsFile(BaseModel, extra="forbid"):
@@ -41,10 +41,8 @@ def _points_of(reference: Any) -> Any:
     if not (isinstance(reference, dict) and reference.get("kind") == "file"):
         return reference
     try:
-        return read_points(PointsFile.model_validate(reference).path)
-    except ValidationError as error:
-        raise ValueError("; ".join(problems(error, PointsFile))) from None
-    except PointsError as error:
+        return read_points(valid(PointsFile, reference).path)
+    except ConfigError as error:
         raise ValueError(str(error)) from None
 
 

@@ -71,11 +71,7 @@ def run_experiment(
         duration_s: Duration on the law's clock [s].
         plant: Plant to control; the emulated one of the configuration if None.
         controller: Controller to run; the configuration's if None.
-        watch: Called at every tick with the tick index, the measurement frame and the command frame; an empty frame
-            is one that was not sent.
-
-    Returns:
-        Figures of merit, such as `z_track` [s] and `u_total` [V²·s].
+        watch: Called at every tick with its index, the measurement and the command frame; empty where none was sent.
 
     Raises:
         ValueError: The plant tripped, or the configuration makes no loop.

@@ -1,8 +1,8 @@
 """Hardware-in-the-loop tests: runs controller, plant and recorder as a process group, operates it and injects faults.
 
-The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too, in a script with the usual
-`if __name__ == "__main__":`. In real time `run` sleeps; in lockstep the plant takes an exact number of steps, and what
-an operator requests between two of them holds from the next tick on, so a test repeats bit for bit on a busy machine.
+The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too. In real time `run` sleeps; in lockstep
+the plant takes an exact number of steps, and what an operator requests holds from the next tick on, so a test repeats
+bit for bit on a busy machine.
 """
 
 from __future__ import annotations
@@ -108,17 +108,14 @@ class Hil:
             self.eventually("the controller drives the plant", self._closed)
 
     @property
-    def _steps(self) -> bool:
-        """Whether the plant takes a step on request only."""
+    def _steps(self) -> bool:  # on request only
         return self._lockstep and self._plant["plant.via"] == "emulator"
 
     def run(self, seconds: float) -> None:
         """Run the loop for a time; in lockstep for that many steps, or until the session ends.
 
         In lockstep an emulator stops between two calls; other plants run on, so they take at least that many steps.
-
-        Raises:
-            HilError: A process has failed or, in lockstep, the plant does not step in time.
+        Raises HilError if a process has failed or, in lockstep, the plant does not step in time.
         """
         self._check_running()
         if not self._lockstep:
@@ -160,11 +157,9 @@ class Hil:
         return self.track(Hold(attitude=(roll, pitch, yaw)), in_s)
 
     def track(self, reference: Reference | Mapping[str, Any] | Path, in_s: float | None = None) -> str:
-        """Follow another reference, as `aeroloop op track`.
+        """Follow a reference, a table as of `[reference]`, or a CSV file of points, as `aeroloop op track`.
 
-        Args:
-            reference: A reference, a table as of `[reference]` (`{"kind": "sinusoid", …}`), or a CSV file of points.
-            in_s: Time to reach it, as of `--in` [s]; None for the shortest within the limits.
+        `in_s` is the time to reach it [s]; None for the shortest within the limits.
         """
         followed = read_points(reference) if isinstance(reference, Path) else reference
         return self._operate("track", Track, reference=followed, within_s=in_s)
@@ -174,10 +169,7 @@ class Hil:
         return self._operate("set_gains", Gains, **gains)
 
     def inject(self, fault: str | None) -> str:
-        """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
-
-        None clears all faults.
-        """
+        """Inject `signal:kind[=value][@start[..end]]`, times in s from now, into the plant; None clears all faults."""
         return self._operate("inject", Inject, faults=[fault] if fault else [], clear=fault is None)
 
     # ── processes ──
@@ -257,10 +249,7 @@ class Hil:
             self._processes.close()
 
     def evidence(self) -> list[str]:
-        """Stop all processes and write what explains a failure beside each log: page and events.
-
-        Returns a line for each file: its path and what it is. Configuration and output of daemons are there already.
-        """
+        """Stop all processes, write page and events beside each log, and return a line for each file there."""
         self.finish()
         lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]
         outputs = sorted(output for log in self._logs for output in log.path.with_suffix("").glob("*.txt"))
