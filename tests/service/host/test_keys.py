@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import stat
-from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.transport.certificate import CertificateError, load, own_certificate, read_certificate
 from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.cli.main import execute as run
@@ -48,9 +45,8 @@ def test_what_is_issued_can_be_used_for_ninety_days(folder: Path, role: str, veh
 
 def test_keys_are_the_owners_alone(folder: Path) -> None:
     keys.issue(folder, "operator", "Ada")
-    keys.issue(folder, "observer", "Ada")
     secrets = [path for path in folder.iterdir() if b"PRIVATE" in path.read_bytes()]
-    assert len(secrets) == 3
+    assert len(secrets) == 2
     assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     (folder / "open").mkdir(mode=0o755)
@@ -58,18 +54,12 @@ def test_keys_are_the_owners_alone(folder: Path) -> None:
         keys.init(folder / "open")
 
 
-@pytest.mark.parametrize(
-    "again",
-    [
-        keys.init,
-        lambda folder: keys.issue(folder, "operator", "Eve"),
-    ],
-)
-def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -> None:
+def test_nothing_is_overwritten(folder: Path) -> None:
     keys.issue(folder, "operator", "Ada")
     before = files(folder)
-    with pytest.raises(CertificateError, match="is not overwritten"):
-        again(folder)
+    for again in (keys.init, lambda folder: keys.issue(folder, "operator", "Eve")):
+        with pytest.raises(CertificateError, match="is not overwritten"):
+            again(folder)
     assert files(folder) == before
 
 
@@ -106,10 +96,6 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     authority = Authority(tmp_path / "keys", days=100)
     authority.issue("plant", "aero", ends=50 * DAY)
     authority.issue("operator", ends=13 * DAY)
-    findings = {finding.what: finding for finding in certificate_findings(of(authority.folder))}
-    assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
-    assert "13 days left" in findings["operator.pem"].found
-    assert "keys issue" in findings["operator.pem"].advice
     words = ["host", "keys", "show", "--json", "--directory", str(authority.folder)]
     assert run(words) == 0
     authority.issue("observer", ends=-DAY)
@@ -118,30 +104,15 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     assert "expired" in rows["observer.pem"]["problem"]
     assert rows["plant.aero.pem"]["problem"] is None
     assert 49 < rows["plant.aero.pem"]["days_left"] < 51
-    assert not {finding.what: finding for finding in certificate_findings(of(authority.folder))}["observer.pem"].good
+    findings = {finding.what: finding for finding in certificate_findings(of(authority.folder))}
+    assert [name for name, finding in findings.items() if not finding.good] == ["observer.pem", "operator.pem"]
+    assert findings["operator.pem"].found == "13 days left"
+    assert "keys issue" in findings["operator.pem"].advice
     (missing,) = certificate_findings(of(tmp_path))
     assert not missing.good
     monkeypatch.setenv("COLUMNS", "120")
     assert run([*words[:3], *words[4:]]) == 1
     assert "observer.pem expired" in capfd.readouterr().out
-
-
-@pytest.mark.parametrize(("days", "said"), [(13, True), (15, False)])
-def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
-    days: int, said: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
-    from datetime import UTC, datetime
-
-    from aeroloop.service.host.operator import Gathered
-    from aeroloop.service.terminal.roles import status_sheets
-    from aeroloop.service.terminal.show import show_all
-
-    until = datetime.now(UTC) + timedelta(days=days)
-    status = Status(
-        role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, certificate_until=until
-    )  # fmt: skip
-    show_all(status_sheets(Gathered({"aero": {"plant": status}}, [])))
-    assert (f"expires at {until:%Y-%m-%d}" in capfd.readouterr().out) == said
 
 
 def test_the_command_line_makes_what_two_hosts_need(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
