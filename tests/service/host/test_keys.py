@@ -43,24 +43,18 @@ def test_what_is_issued_can_be_used_for_ninety_days(folder: Path, role: str, veh
     assert load(file).subject.rfc4514_string() == f"OU=lab 2,CN={common_name(role, vehicle)}"
 
 
-def test_keys_are_the_owners_alone(folder: Path) -> None:
-    keys.issue(folder, "operator", "Ada")
-    secrets = [path for path in folder.iterdir() if b"PRIVATE" in path.read_bytes()]
-    assert len(secrets) == 2
-    assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    (folder / "open").mkdir(mode=0o755)
-    with pytest.raises(CertificateError, match="chmod 700"):
-        keys.init(folder / "open")
-
-
-def test_nothing_is_overwritten(folder: Path) -> None:
+def test_keys_are_the_owners_alone_and_nothing_is_overwritten(folder: Path) -> None:
     keys.issue(folder, "operator", "Ada")
     before = files(folder)
+    secrets = [folder / name for name, content in before.items() if b"PRIVATE" in content]
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (folder, *secrets)] == [0o700, 0o600, 0o600]
     for again in (keys.init, lambda folder: keys.issue(folder, "operator", "Eve")):
         with pytest.raises(CertificateError, match="is not overwritten"):
             again(folder)
     assert files(folder) == before
+    (folder / "open").mkdir(mode=0o755)
+    with pytest.raises(CertificateError, match="chmod 700"):
+        keys.init(folder / "open")
 
 
 def test_no_certificate_outlives_its_authority(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

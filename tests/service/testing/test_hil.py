@@ -39,7 +39,7 @@ def test_settings_may_be_nested_or_dotted_or_both() -> None:
     nested = {"vehicle": "b", "loop": {"rate_hz": 200}, "wire": {"rate.bits": 10}, "can": {"options.port": 7}}
     loaded = load(overrides=as_overrides(nested))
     assert (loaded.loop.rate_hz, loaded.wire.rate.bits, loaded.can.options) == (200, 10, {"port": 7})
-    assert loaded.description() == load(overrides=as_overrides(dotted)).description()
+    assert loaded == load(overrides=as_overrides(dotted))
 
 
 def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path) -> None:
@@ -47,7 +47,6 @@ def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path)
     judged = read(tmp_path / "a.mcap").findings
     figures = RunFigures(judged)
     assert figures.z_track == judged.z_track
-    assert figures.command.frames_per_s == judged.command.frames_per_s
     assert figures.model_dump() == judged.model_dump()
     assert repr(figures) == f"figures of session {judged.session}"  # pytest prints it in a failed assertion
     lacking = RunFigures(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
@@ -59,8 +58,7 @@ def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path)
 
 def test_evidence_is_a_page_and_the_events_beside_the_log(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 50)
-    lines = list(HilLog(tmp_path / "a.mcap").evidence([]))
-    paths = [Path(line.partition(": ")[0]) for line in lines]
+    paths = [Path(line.partition(": ")[0]) for line in HilLog(tmp_path / "a.mcap").evidence([])]
     assert [path.name for path in paths] == ["a.mcap", "a-events.txt", "a.html"]
     assert all(path.stat().st_size for path in paths)
     assert "</html>" in (tmp_path / "a.html").read_text()
@@ -69,9 +67,7 @@ def test_evidence_is_a_page_and_the_events_beside_the_log(tmp_path: Path) -> Non
 def test_evidence_of_a_log_that_cannot_be_read_names_the_reason_and_has_the_events_received(tmp_path: Path) -> None:
     event = Event(role="plant", kind="tripped", text="no command for 100 ms: 0 V", session="s1", tick=7)
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
-    lines = list(HilLog(tmp_path / "a.mcap").evidence([event]))
-    assert lines[-1].startswith("no page: ReviewError: ")
-    assert (
-        " ".join((tmp_path / "a-events.txt").read_text().split()) == "plant tripped no command for 100 ms: 0 V (tick 7)"
-    )
+    *_, last = HilLog(tmp_path / "a.mcap").evidence([event])
+    assert last.startswith("no page: ReviewError: ")
+    assert "no command for 100 ms: 0 V  (tick 7)" in (tmp_path / "a-events.txt").read_text()
     assert list(HilLog(tmp_path / "b.mcap").evidence([event])) == [f"{tmp_path / 'b.mcap'}: no log was written"]
