@@ -131,7 +131,7 @@ def burden(
             from aeroloop.service.report.figure_style import check_path
 
             check_path(figure)
-            check_output(figure, [config], force=force)
+        check_output(figure, [config], force=force)
         cells = grid(settings, bits or (), quantizer or ())
     with working("experiments", json) as update:
         result = measure_burden(settings, cells, duration, update, engine)
@@ -228,9 +228,8 @@ def tune(
     from aeroloop.service.lab.tune import TuneOptions, sheets, toml_of, tune
     from aeroloop.service.logs.outputs import check_output, writing
 
-    if out is not None:
-        with checked():
-            check_output(out, [config], force=force)
+    with checked():
+        check_output(out, [config], force=force)
     options = TuneOptions(gain or (), seeds, held_out, budget, duration)
     with working("experiments", json) as update, open_workers(engine) as workers:
         found = tune(settings, options, workers, update)

@@ -9,25 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from aeroloop.service.cli.common import (
-    Config,
-    Force,
-    Json,
-    Overrides,
-    checked,
-    fail,
-    load_settings,
-    report,
-    show,
-    working,
-)
+from aeroloop.service.cli.common import Config, Force, Json, Overrides, fail, load_settings, report, show, working
 from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.service.review.report import Report
-    from aeroloop.service.review.requirements import Limit
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.")]
 Html = Annotated[Path | None, typer.Option("--html", help="Write an interactive page that needs no network.")]
@@ -71,14 +59,14 @@ def review(
     json: Json = False,
 ) -> None:
     """Compute every figure of a run from its logs. Checks limits, and draws the paper's figures."""
-    limits = _limits(require)
-    _check_output(html, logs, force)
-    _check_part(since_s, until_s)
-    from aeroloop.service.logs.outputs import writing_into
-    from aeroloop.service.review.requirements import broken_limits
+    from aeroloop.service.logs.outputs import check_output, writing_into
+    from aeroloop.service.review.requirements import Limit, broken_limits
     from aeroloop.service.review.review import read
     from aeroloop.service.terminal.log_sheets import review_sheets
 
+    limits = [Limit.parse(text) for text in require or []]
+    check_output(html, logs, force=force)
+    _check_part(since_s, until_s)
     with working("reading", json, 1) as update:
         judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
     if figures is not None:
@@ -89,7 +77,7 @@ def review(
         names = ", ".join(dict.fromkeys(path.stem for path in drawn))
         report(f"drew {names} into {figures}, as PDF, SVG and PNG")
     if html is not None:
-        write_html([judged.report(limits)], html, logs, force)
+        _write_page([judged.report(limits)], html, logs, force)
     findings = judged.checked(limits)
     show(findings, json, review_sheets)
     if broken := broken_limits(findings):
@@ -107,26 +95,20 @@ def compare(
     """Compare figures and configurations of several runs."""
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
-    limits = _limits(require)
-    _check_output(html, logs, force)
+    from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.review.compare import Comparison, read_runs
-    from aeroloop.service.review.requirements import broken_limits
+    from aeroloop.service.review.requirements import Limit, broken_limits
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 
+    limits = [Limit.parse(text) for text in require or []]
+    check_output(html, logs, force=force)
     with working("reading", json, 1) as update:
         reports = read_runs(logs, limits, update)
     if html is not None:
-        write_html(reports, html, logs, force)
+        _write_page(reports, html, logs, force)
     show(Comparison.of(reports), json, lambda _: comparison_sheets(reports))
     if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
-
-
-def _limits(require: Sequence[str] | None) -> list[Limit]:
-    from aeroloop.service.review.requirements import Limit
-
-    with checked():
-        return [Limit.parse(text) for text in require or []]
 
 
 def _check_part(since_s: float, until_s: float) -> None:
@@ -134,16 +116,7 @@ def _check_part(since_s: float, until_s: float) -> None:
         fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
 
 
-def _check_output(out: Path | None, logs: Sequence[Path], force: bool) -> None:
-    """Check, before the logs are read, that their page may be written. Raises OutputError."""
-    if out is not None:
-        from aeroloop.service.logs.outputs import check_output
-
-        check_output(out, logs, force=force)
-
-
-def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
-    """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
+def _write_page(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     from aeroloop.service.logs.outputs import writing
     from aeroloop.service.report.page import page
 

@@ -42,8 +42,7 @@ def _stop_on_signals() -> tuple[Event, Event]:
     """Log to stderr, and return events: one to set once the process has begun, one that a signal to stop sets.
 
     Before the process has begun, a signal ends it. Why a thread waits for signals: a handler would run in the main
-    thread, where Zenoh may be waiting for a peer, and which may hold the lock of the event that the handler sets: then
-    the process would never end.
+    thread, which may wait in Zenoh, or hold the lock of the event that the handler sets: it would never end.
     """
     handler = logging.StreamHandler()
     line = "%(asctime)s %(levelname)s %(role)s: %(message)s"

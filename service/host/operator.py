@@ -1,8 +1,7 @@
 """Operator commands: status of every role on the network, arm, stop, release, gains and reference.
 
-Each is a Zenoh query that the addressed role answers. Status is answered by the role's network thread from the last
-published one, so it never stalls a loop; the other commands are taken between two ticks. A process that hangs or that
-is no role delays none of them, and is named by its address and, on this host, by its role and process id.
+Each is a Zenoh query that the addressed role answers: status by its network thread, the others between two ticks. A
+process that hangs or is no role delays none of them, and is named by its address and, on this host, role and pid.
 """
 
 from __future__ import annotations
@@ -36,11 +35,9 @@ class OperatorError(AeroloopError):
 
 
 class Gathered(NamedTuple):
-    """What is on the network.
+    """Statuses by vehicle and role, and a line about each process that accepts a connection and does not answer.
 
-    Attributes:
-        statuses: By vehicle and role. Of several controllers of one vehicle, the one with the session, if any.
-        silent: A line about each process that accepts a connection and does not answer.
+    Of several controllers of one vehicle, the status of the one with the session, if any.
     """
 
     statuses: dict[str, dict[str, Status]]
@@ -66,8 +63,7 @@ def gather(network: NetworkSettings) -> Gathered:
 def only_vehicle(network: NetworkSettings) -> str | None:
     """The one vehicle on the network that has a controller or a plant; None if there is none.
 
-    Raises:
-        OperatorError: There are several.
+    Raises OperatorError if there are several.
     """
     try:
         found = gather(network).statuses

@@ -1,7 +1,6 @@
 """systemd units for the daemons, written from one template for the configured plant.
 
-`Type=notify`: a daemon notifies systemd when it is ready, once a second while it runs, and when it stops. The sandbox
-allows what the configuration needs: the network, the plant's bus or device, the folders of interpreter and
+The sandbox allows what the configuration needs: the network, the plant's bus or device, the folders of interpreter and
 configuration, and the recorder's logs.
 """
 
@@ -32,8 +31,7 @@ _WITHOUT_DEVICE: Final = ("socketcan", "socketcand", "udp_multicast", "virtual")
 """python-can's interfaces that open no device file."""
 
 _TEMPLATE: Final = """\
-# For plant.via = "{via}", by `aeroloop host units`; make it again when that changes. Your own changes go to
-# `systemctl edit`, which keeps them in another file.
+# For plant.via = "{via}", by `aeroloop host units`; your own changes go to `systemctl edit`.
 [Unit]
 Description=aeroloop: {what}
 After=network-online.target

@@ -1,7 +1,6 @@
 """Live view of the network, `op top`: every role of every vehicle, from its published messages.
 
-Subscribes to status, telemetry, truth and events. What is shown is true now: values of a session that has ended are
-left out, and what was not received for `SILENT_S` is marked with its age.
+What is shown is true now: values of a session that has ended are left out, and what is silent is marked with its age.
 """
 
 from __future__ import annotations

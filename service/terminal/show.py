@@ -29,13 +29,9 @@ _GAP: Final = 2
 
 
 def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
-    """Print rows, all with the same columns, and a title; without rows the title is a paragraph.
+    """Print rows, all with the same columns, below a title; without rows the title is a paragraph.
 
-    Args:
-        rows: From column to text.
-        title: Above the table, in a terminal and in Markdown.
-        form: For a person or for a document.
-        keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
+    So many first columns (`keys`) name a row: each block has them where a terminal is too narrow for all columns.
     """
     if form == "markdown":
         typer.echo("\n".join(_markdown(rows, title)))
