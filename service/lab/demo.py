@@ -11,6 +11,7 @@ from typing import Self
 
 from pydantic import Field
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.recording.rolling import log_path, parts
@@ -52,6 +53,7 @@ def run_demo(
     Raises:
         HilError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be reviewed.
+        KeyboardInterrupt: ^C before there was anything to review.
     """
     path = log_path(log or settings.recorder.path, "demo-%Y%m%d-%H%M%S-%f.mcap")
     settings = standalone(settings, path, duration_s=duration_s)
@@ -72,7 +74,12 @@ def run_demo(
             show("" if processes.telemetry else "the first command", processes)
         processes.check()
         show("the review of the log", processes)
-    return DemoFigures.of(parts(path)), not interrupted.is_set()
+    try:
+        return DemoFigures.of(parts(path)), not interrupted.is_set()
+    except AeroloopError:
+        if interrupted.is_set():
+            raise KeyboardInterrupt from None  # before there was anything to review
+        raise
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from operator import methodcaller
 from pathlib import Path
@@ -74,7 +75,12 @@ def start_command(words: Sequence[str], output: Path, environment: Mapping[str, 
     )
     # NumPy would start threads at its import, before the command blocks the signals that its own thread waits for.
     with patch.dict(os.environ, {"OPENBLAS_NUM_THREADS": "1", **(environment or {})}):
-        process.start()
+        resource_tracker.ensure_running()  # it ends with SIGINT unblocked
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the server inherits it: ^C is not for it
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return process
 
 
@@ -87,7 +93,7 @@ def _run_command(words: list[str], output: Path, environment: Mapping[str, str])
     os.environ.update(environment)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # in the thread, which handles none
     Thread(target=_follow_parent, daemon=True).start()
-    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before - {signal.SIGINT})
     sys.argv[1:] = words
     run_module("aeroloop", run_name="__main__")
 
