@@ -26,13 +26,6 @@ BEFORE_SHOWN: Final = 4
 SHOWN: Final = 12
 """Lines of one kind; `--json` has them all."""
 
-LAPSES: Final = {
-    "late": "late measurements", "malformed": "malformed measurements", "stale": "stale commands",
-    "repeated": "repeated commands", "refused": "refused commands",
-    "withheld": "commands dropped or delayed by a fault", "missed": "measurements that the controller missed",
-}  # fmt: skip
-"""What `Findings.lapses` counts."""
-
 
 def figure_sheets(figures: Figures) -> Sheets:
     """Main figures of merit of one run, each that is missing with its reason; its trips, damages and log."""
@@ -122,7 +115,7 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
     yield "at the outermost level", ", ".join(shares)
     yield from ((f"invalid {name}s", str(n)) for name, n in findings.invalid.items() if n)
     if findings.lapses:
-        yield "frames and ticks", ", ".join(f"{LAPSES[name]}: {n:,}" for name, n in findings.lapses.items())
+        yield "frames and ticks", ", ".join(f"{name}: {n:,}" for name, n in findings.lapses.items())
     differing = [f"{each.key}: controller {each.controller}, plant {each.plant}" for each in findings.disagreements]
     yield from (("ends disagree", line) for line in _some(differing))
     if findings.log:

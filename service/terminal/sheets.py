@@ -61,12 +61,8 @@ def wire_sheets(wire: WireSpec) -> Sheets:
         if isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
             step = f"{quantizer.step:.6g}"
         if isinstance(quantizer, LogarithmicQuantizer):
-            step = f"≤ {step}"
-            least = quantizer.edges[1] - quantizer.edges[0]
-            notes.append(
-                f"{name}: 0 within ±{quantizer.deadzone:.6g}, then {quantizer.growing} steps that grow from "
-                f"{least:.3g} up to ±{quantizer.threshold:.6g}, and {quantizer.top - quantizer.growing} alike [{unit}]"
-            )
+            grows = f"{quantizer.growing} steps grow from {quantizer.edges[1] - quantizer.edges[0]:.3g} {unit}"
+            notes.append(f"{name}: {grows} up to ±{quantizer.threshold:.6g} {unit}, the others are alike")
         elif isinstance(quantizer, HysteresisQuantizer):
             notes.append(f"{name}: a level is held for {quantizer.hysteresis:.6g} {unit} beyond its interval")
         kind, bits = ("–", "cont") if signal.bits is None else (signal.kind, str(signal.bits))
