@@ -127,7 +127,6 @@ def test_a_description_is_read_without_the_environment_and_keys_of_other_version
 
 
 OVERRIDES: tuple[tuple[str, ...], ...] = (
-    (),
     ("reference.kind=hold", "wire.rate.bits=cont", "recorder.path=a b.mcap", "controller.duration_s=3"),
     ("reference.kind=stream", 'can.options={bitrate = 1000000, "odd key" = "x"}', 'plant.faults=["rate:off@5"]'),
     ("reference.kind=points", "reference.times=[0, 1e-2]", "reference.attitudes=[[0,0,0],[0,1,2]]"),

@@ -69,11 +69,6 @@ def test_the_public_names_are_those_and_each_is_documented() -> None:
         aeroloop.nonsense  # noqa: B018  # the access is what is tested
 
 
-def test_importing_the_package_imports_nothing_heavy() -> None:
-    heavy = "import sys, aeroloop; print({'casadi', 'numpy', 'zenoh', 'pydantic'} & set(sys.modules))"
-    assert run(Path.cwd(), "-c", heavy) == "set()\n"
-
-
 def test_an_experiment_takes_a_plant_and_a_controller_of_ones_own() -> None:
     settings = aeroloop.load_settings(overrides={"wire.voltage.bits": 8})
     controller = aeroloop.Controller(settings.wire, settings.law, settings.reference, settings.loop.period)

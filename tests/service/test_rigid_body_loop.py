@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from math import cos, radians, sin, sqrt
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,10 @@ import pytest
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.service import examples
 from aeroloop.service.config import Settings, as_overrides, bits_overrides, load, load_over
 from aeroloop.service.control.controller import Controller
 from tests.support import numpy_twin as twin
-from tests.support.ideal import IDEAL
 from tests.support.numpy_twin import Array
 
 BODY = (
@@ -31,17 +32,14 @@ BODY = (
 """What the plant is and the law believes. J, B and r_g are not the paper's, and B is full."""
 
 OTHER = load(
+    Path(examples.__path__[0]) / "rigid-body.toml",
     overrides=[
-        "plant.kind=rigid_body",
-        *IDEAL,
         "plant.voltage_limit=36",
         "plant.rigid_body.damping=[0.012, 0.008, 0.015]",
         "law.C1=[0.5, 0.6, 0.4]",
         "law.C2=[0.35, 0.3, 0.4]",
         "law.Gamma=[0.03, 0.01, 0.02]",
-        "law.damping_estimate=[0.0, 0.0, 0.0]",
         "law.damping_bound=0.04",
-        "wire.actuators=3",
         "wire.rate.limit=2.0",
         "wire.voltage.limit=36",
         "loop.rate_hz=250",
@@ -49,7 +47,7 @@ OTHER = load(
         "reference.frequency=[0.1, 0.13, 0.08]",
         *(f"plant.rigid_body.{value}" for value in BODY),
         *(f"law.{value}" for value in BODY),
-    ]
+    ],
 )
 """400° is more than a turn, to and fro; roll and yaw do it in turns of different length, with up to 0.9 rad/s."""
 

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import socket
 import subprocess
 import sys
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
-from aeroloop.protocol.runtime import node, realtime
-from aeroloop.protocol.transport.zenoh_config import THREADS
 from aeroloop.service.cli.main import app, execute
-from aeroloop.service.cli.processes import run_role
-from aeroloop.service.config import load
 
 
 def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -115,21 +108,3 @@ def test_help_and_an_operators_stop_wait_for_no_mathematics(words: tuple[str, ..
     imported = set(printed.splitlines()[-1].split())
     assert "aeroloop.service.cli.op" in imported
     assert not imported & {"casadi", "scipy", "mcap", "matplotlib", "plotly", "aeroloop.service.config"}
-
-
-def test_zenoh_gets_several_threads_in_a_daemon_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One slow peer then blocks one of them. A library call sets nothing: the variable is the user's there."""
-    threads: list[str | None] = []
-
-    def joins(*_: object) -> AbstractContextManager[Mock]:
-        threads.append(os.environ.get("ZENOH_RUNTIME"))
-        return nullcontext(Mock())
-
-    monkeypatch.setattr(node, "Node", joins)
-    monkeypatch.setattr(realtime, "no_linger", lambda: None)  # it would filter the tests' own system calls
-    for configured, used in ((None, THREADS), ("(rx: (worker_threads: 2))", "(rx: (worker_threads: 2))")):
-        monkeypatch.delenv("ZENOH_RUNTIME", raising=False)
-        if configured is not None:
-            monkeypatch.setenv("ZENOH_RUNTIME", configured)
-        run_role("plant", load(), lambda _: None)
-        assert threads[-1] == used
