@@ -117,7 +117,7 @@ def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdow
     if json:
         from pydantic_core import to_json
 
-        typer.echo(to_json(result, indent=2, inf_nan_mode="null"))
+        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
     else:
         from aeroloop.service.terminal.show import show_all
 

@@ -122,19 +122,10 @@ def install(folder: Path, source: Source) -> list[Path]:
 
 def next_steps(folder: Path | None, source: Source) -> list[str]:
     """Commands that remain after `install` into a folder (None: the units were printed) until the daemons run."""
-    steps = []
-    if not source.config.exists():
-        steps = [
-            f"sudo mkdir -p {source.config.parent}",
-            f"aeroloop show config | sudo tee {source.config} >/dev/null",
-        ]
-    if folder is None:
-        command = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
-        steps.append(f"sudo {shlex.join(command)}")
-    elif folder.absolute() != SYSTEM_FOLDER:
-        steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
+    install = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
     names = " ".join(f"aeroloop-{name}" for name in units_of(source.settings))
-    return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
+    steps = ["sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
+    return steps if folder is not None else [f"sudo {shlex.join(install)}", *steps]
 
 
 def _executable() -> list[str]:
