@@ -8,8 +8,7 @@ from math import degrees
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from aeroloop.protocol.wire.attitude import angle
 
@@ -18,20 +17,11 @@ if TYPE_CHECKING:
     from aeroloop.service.testing.process_group import ProcessGroup
 
 
-class _Done(ProgressColumn):
-    """Seconds or runs done, of how many; of a share 0…1 the percentage."""
-
-    def render(self, task: Task) -> Text:
-        if task.total is None:
-            return Text(f"{task.completed:g}")
-        return Text(f"{task.percentage:.0f} %" if task.total == 1 else f"{task.completed:.0f}/{task.total:.0f}")
-
-
 @contextmanager
 def progress_bar(title: str, total: float | None = None, *, hidden: bool = False) -> Iterator[Callable[..., None]]:
     """A bar, updated by the yielded `update(done, total, title)`; what is None stays."""
     console = Console(stderr=True)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(20), _Done(), TimeRemainingColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(20), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as progress:
         task = progress.add_task(title, total=total)
 
