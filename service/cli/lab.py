@@ -128,7 +128,7 @@ def burden(
 
     with checked():
         if figure is not None:
-            from aeroloop.service.report.figure_style import check_path
+            from aeroloop.service.report.plots import check_path
 
             check_path(figure)
         check_output(figure, [config], force=force)

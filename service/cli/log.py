@@ -96,8 +96,8 @@ def compare(
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
     from aeroloop.service.logs.outputs import check_output
-    from aeroloop.service.review.compare import Comparison, read_runs
     from aeroloop.service.review.requirements import Limit, broken_limits
+    from aeroloop.service.review.review import Comparison, read_runs
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 
     limits = [Limit.parse(text) for text in require or []]

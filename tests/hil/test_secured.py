@@ -62,12 +62,10 @@ STRANGERS: Final = {
     ("plant", "bero"): frozenset(topics.TOPICS),
     ("controller", "bero"): frozenset(topics.TOPICS),
     ("operator", "bero"): frozenset(topics.TOPICS),
-}
-"""Certificates, and topics that are not theirs."""
+}  # certificates, and topics that are not theirs
 
 
 def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:
-    """Do with these topics what would end, steal or disturb a running session."""
     requests: dict[str, Message] = {
         **dict.fromkeys(("stop", "stand_down", "arm"), Request()),
         "release": Release(session=running),
