@@ -136,7 +136,6 @@ class Daemon:
         record, state = shared.changes.record, shared.machine.state
         self._shown = state, record
         self._shared.claims.keep(record)
-        shared.age.turn_when_due()
         refused = counts.refused + shared.changes.refused + (session.refused if session else 0)
         self._role.status(Status(
             role=self._role.role, state=state, session=shared.claims.session,
@@ -144,7 +143,7 @@ class Daemon:
             ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
             skipped=counts.skipped, received=counts.received, sent=counts.sent, refused=refused, stale=counts.stale,
             saturated=counts.saturated + (session.controller.saturated if session else 0),
-            age_us=shared.age.recent().summary(), timing=shared.timing.report() if shared.timing else None,
+            age_us=shared.age.recent(), timing=shared.timing.report() if shared.timing else None,
             notes=self._notes, lacks_recorder=self._lacks_recorder(), gains=record.gains, gains_from=record.gains_from,
             reference=in_words(record.reference), reference_from=record.reference_from,
         ))  # fmt: skip

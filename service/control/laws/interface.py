@@ -41,7 +41,7 @@ class LawSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="strings")
 
-    kind: str = Field(description="which law: one of ours, an entry point of aeroloop.laws, or package.module:Class")
+    kind: str = Field(description="which law: one of ours, or package.module:Class")
     inertia: Diagonal = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")

@@ -59,7 +59,7 @@ class LawError(AeroloopError):
 
 def law_class(section: LawSettings) -> type[Law[Any]]:
     """The class of the law that a section configures. Raises PluginError."""
-    return find("law.kind", section.kind, "aeroloop.laws", BUILT_IN, Law)
+    return find("law.kind", section.kind, BUILT_IN, Law)
 
 
 def law_settings(section: LawSettings) -> LawSettings:

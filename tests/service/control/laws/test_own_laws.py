@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import EntryPoint
 from math import isnan
 from pathlib import Path
 from random import Random
@@ -16,7 +15,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol import plugins
 from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
@@ -119,15 +117,6 @@ def test_gains_are_bounded_by_the_law_and_it_has_no_others() -> None:
     ):
         with pytest.raises(LawError, match=why):
             with_gains(law, gains)
-
-
-def test_an_entry_point_of_the_group_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def installed(*, group: str) -> list[EntryPoint]:
-        return [EntryPoint("ours", EXPRESSIONS, group)] if group == "aeroloop.laws" else []
-
-    monkeypatch.setattr(plugins, "entry_points", installed)
-    assert type(law("ours")) is Expressions
-    assert ", ours, " in refused("theirs")
 
 
 SOURCE = """from aeroloop import LawSettings, PythonLaw
