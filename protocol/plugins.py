@@ -17,7 +17,7 @@ from sysconfig import get_path
 from traceback import extract_tb
 from typing import Any, Final, TypeVar
 
-from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.errors import ConfigError
 
 T = TypeVar("T")
 
@@ -25,7 +25,7 @@ _HERE: Final = str(Path(__file__).parent.parent)
 _PACKAGES: Final = {"site-packages", "dist-packages"}
 
 
-class PluginError(AeroloopError):
+class PluginError(ConfigError):
     """A class that is not there, is of another kind, or failed; one line with its name."""
 
 

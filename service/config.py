@@ -11,22 +11,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
-from pydantic_settings import SettingsConfigDict
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings, counter_fills_frame
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
-from aeroloop.protocol.wording import problems
+from aeroloop.protocol.wording import keys
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
-from aeroloop.service.config_sources import Sources, Target, merged, read, tree_of
+from aeroloop.service.config_sources import Target, merged, read_sources, tree_of, valid
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import CustomLawSettings, LawSection, law_settings
-from aeroloop.service.settings import ControllerSettings, PointsError, RecorderSettings, read_points
+from aeroloop.service.control.laws.registry import CustomLawSettings, LawError, LawSection, law_settings
+from aeroloop.service.settings import ControllerSettings, RecorderSettings, read_points
 
 
 class PointsFile(BaseModel, extra="forbid"):
@@ -42,10 +41,8 @@ def _points_of(reference: Any) -> Any:
     if not (isinstance(reference, dict) and reference.get("kind") == "file"):
         return reference
     try:
-        return read_points(PointsFile.model_validate(reference).path)
-    except ValidationError as error:
-        raise ValueError("; ".join(problems(error, PointsFile))) from None
-    except PointsError as error:
+        return read_points(valid(PointsFile, reference).path)
+    except ConfigError as error:
         raise ValueError(str(error)) from None
 
 
@@ -119,32 +116,32 @@ class Settings(Target):
         return toml(self.description(), self if comments else None)
 
 
-def with_law_settings(settings: Settings) -> Settings:
-    """The configuration with a user's law as its own model has it, defaults included; for what runs the law.
-
-    Raises:
-        PluginError: There is no such law.
-        LawError: Its settings are wrong.
-    """
-    return settings.model_copy(update={"law": law_settings(settings.law)})
-
-
-def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
+def load(file: Path | None = None, overrides: Sequence[str] = (), *, runs_law: bool = False) -> Settings:
     """The effective configuration.
 
     Args:
         file: A TOML file, or None.
         overrides: `section.key=value`, values as TOML writes them (quotes may be left out).
+        runs_law: Whether the law runs in this process: as `with_law_settings`.
 
     Raises:
         ConfigError: The configuration is wrong.
     """
+    defaults = Settings().model_dump(exclude={"law"})  # a section may set one key of a signal, and leave the others
+    settings = valid(Settings, merged(defaults, read_sources(file, overrides, keys(Settings))))
+    return with_law_settings(settings) if runs_law else settings
 
-    class Configured(Settings, Sources):
-        model_config = SettingsConfigDict(toml_file=file)
 
-    found = read(Configured, overrides)
-    return Settings.model_construct(found.model_fields_set, **dict(found))
+def with_law_settings(settings: Settings) -> Settings:
+    """The configuration with a user's law as its own model has it, defaults included. This imports its module.
+
+    Raises:
+        ConfigError: There is no such law, or its settings are wrong.
+    """
+    try:
+        return settings.model_copy(update={"law": law_settings(settings.law)})
+    except LawError as error:
+        raise ConfigError(str(error)) from None
 
 
 def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
@@ -168,31 +165,23 @@ def from_description(config: dict[str, Any]) -> Settings:
     """
     if missing := [name for name in Settings.model_fields if name not in config]:
         raise ConfigError(f"a description without {', '.join(missing)}")
-    settings = _valid(config, extra="ignore")
+    settings = valid(Settings, config, extra="ignore")
     if isinstance(settings.law, CustomLawSettings):  # keys of a user's law, which are not ours to know
         return settings.model_copy(update={"law": CustomLawSettings.model_validate(config["law"])})
     return settings
 
 
-def _valid(tree: dict[str, Any], extra: Literal["forbid", "ignore"] | None = None) -> Settings:
-    try:
-        return Settings.model_validate(tree, extra=extra)
-    except ValidationError as error:
-        raise ConfigError("; ".join(problems(error, Settings))) from None
-
-
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
-    return _valid(merged(settings.description(), tree_of(overrides)))
+    return valid(Settings, merged(settings.description(), tree_of(overrides)))
 
 
-def with_bits(settings: Settings, text: str | None) -> Settings:
-    """The settings with other bits, as of `SignalBits.parse`; None leaves them unchanged. Raises ConfigError."""
+def bits_overrides(text: str | None) -> list[str]:
+    """Overrides that set the bits of all signals, as of `SignalBits.parse`; none for None. Raises ConfigError."""
     if text is None:
-        return settings
+        return []
     try:
-        bits = SignalBits.parse(text)
+        bits = SignalBits.parse(text)._asdict()
     except ValueError as error:
         raise ConfigError(f"--bits: {error}") from None
-    words = ("cont" if each is None else each for each in bits)
-    return load_over(settings, [f"wire.{name}.bits={word}" for name, word in zip(bits._fields, words, strict=True)])
+    return as_overrides({"wire": {f"{name}.bits": each for name, each in bits.items()}})

@@ -1,29 +1,25 @@
-"""Sources of the configuration, by pydantic-settings: `--set`, the environment and a TOML file, the stronger first.
+"""Sources of the configuration: `--set`, the environment and a TOML file, the stronger first, as one tree.
 
-`Target` is all that a command of `aeroloop op` reads of them.
+`Target` is all that a command of `aeroloop op` reads of it.
 """
 
 from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Final, Self, TypeVar
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 from pydantic import BaseModel, Field, StringConstraints, ValidationError, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    TomlConfigSettingsSource,
-)
 
-from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.errors import ConfigError as ConfigError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wording import closest, keys, problems
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 ENV_PREFIX: Final = "AEROLOOP_"
 """Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
@@ -34,12 +30,11 @@ BODY: Final = ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
 _FREE: Final = ("can.options.", "plant.own.", "law.")
 """Sections in which any key may be given: a user's, or another library's."""
 
+OTHER_SECTIONS: Final = ("loop", "wire", "reference", "law", "controller", "plant", "can", "recorder")
+"""Those that `Target` leaves out."""
+
 _KINDS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {"reference": ("sinusoid", ()), "law": ("adaptive", BODY)}
 """Sections of several kinds: the kind where none is named, and keys that all kinds have."""
-
-
-class ConfigError(AeroloopError):
-    """The configuration is wrong; one line with the key and its allowed values."""
 
 
 class Target(BaseModel, extra="forbid", coerce_numbers_to_str=True):
@@ -62,85 +57,64 @@ class Target(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         return self
 
 
-class Sources(BaseSettings):
-    """Base of a model that is filled from the sources; `toml_file` of its `model_config` is the file, if any."""
+def read_sources(
+    file: Path | None, overrides: Iterable[str], known: Collection[str], unread: Collection[str] = ()
+) -> dict[str, Any]:
+    """The tree of all sources; `known` are the keys that there are, but for those of the sections `unread`.
 
-    model_config = SettingsConfigDict(
-        env_prefix=ENV_PREFIX,
-        env_nested_delimiter="__",
-        case_sensitive=True,  # `_variables` writes every key as its model does
-        enable_decoding=False,  # values are TOML, as with `--set`, and not JSON
-        nested_model_default_partial_update=True,
-    )
-
-    @classmethod
-    def settings_customise_sources(
-        cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource, *_: Any, **__: Any
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """`--set` before the environment before the file."""
-        return init_settings, _Environment(settings_cls), _File(settings_cls)
+    Raises:
+        ConfigError: A source cannot be read, or a variable of the environment is no key.
+    """
+    tree = _file(file) if file is not None else {}
+    for words in (_environment(known, unread), overrides):
+        tree = merged(tree, tree_of(words))
+    return tree
 
 
-class _Environment(EnvSettingsSource):
-    def __init__(self, settings_cls: type[BaseSettings]) -> None:
-        super().__init__(settings_cls)
-        self.env_vars = _variables(settings_cls)
-
-    def __call__(self) -> dict[str, Any]:
-        return merged(_values(super().__call__()), self.current_state)
-
-
-class _File(TomlConfigSettingsSource):
-    def __call__(self) -> dict[str, Any]:
-        tree = super().__call__()
-        reference = tree.get("reference")
-        if isinstance(reference, dict) and isinstance(reference.get("path"), str):
-            reference["path"] = str(Path(str(self.toml_file_path)).parent / reference["path"])
-        return merged(tree, self.current_state)
+def _file(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise ConfigError(f"no configuration file at {path}")
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not TOML: {error}") from None
+    reference = tree.get("reference")
+    if isinstance(reference, dict) and isinstance(reference.get("path"), str):
+        reference["path"] = str(path.parent / reference["path"])
+    return tree
 
 
-def _variables(model: type[BaseModel]) -> dict[str, str | None]:
-    """Variables of the environment that are keys, each written as the model writes it. Raises ConfigError."""
-    known = {key.upper(): key for key in keys(model)}
-    unread = tuple(f"{name}." for name, field in model.model_fields.items() if field.annotation is Any)
-    found: dict[str, str | None] = {}
+def _environment(known: Collection[str], unread: Collection[str]) -> Iterator[str]:
+    """Variables of the environment as words of `--set`, each key as its model writes it. Raises ConfigError."""
+    written = {key.upper(): key for key in known}
     for name, text in os.environ.items():
         if not name.upper().startswith(ENV_PREFIX):
             continue
-        key = name[len(ENV_PREFIX) :].replace("__", ".")
-        if key.upper() in known:
-            key = known[key.upper()]
-        elif key.lower().startswith((*_FREE, *unread)):
-            key = key.lower() if key.isupper() else key
-        else:
-            near = closest(key, known.values())
-            variable = ENV_PREFIX + (near or "").upper().replace(".", "__")
-            hint = f"did you mean {variable}?" if near else "unset it, or see `aeroloop show config`"
-            raise ConfigError(f"{name} in the environment is no setting: {hint}")
-        found[ENV_PREFIX + key.replace(".", "__")] = text
-    return found
-
-
-def _values(tree: dict[str, Any]) -> dict[str, Any]:
-    return {name: _values(each) if isinstance(each, dict) else value_of(each) for name, each in tree.items()}
-
-
-def value_of(text: str) -> Any:
-    """A value as TOML writes it; quotes of a string may be left out."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+        given = name[len(ENV_PREFIX) :].replace("__", ".")
+        key = written.get(given.upper())
+        if key is None:
+            key = given.lower() if given.isupper() else given
+            section = closest(key.partition(".")[0], {*known, *unread})
+            if section not in unread and not key.lower().startswith(_FREE):
+                near = closest(key, known)
+                variable = ENV_PREFIX + (near or "").upper().replace(".", "__")
+                hint = f"did you mean {variable}?" if near else "unset it, or see `aeroloop show config`"
+                raise ConfigError(f"{name} in the environment is no setting: {hint}")
+        yield f"{key}={text}"
 
 
 def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
-    """The tree of `section.key=value` overrides. Raises ConfigError."""
+    """The tree of `section.key=value` words, values as TOML writes them. Raises ConfigError."""
     tree: dict[str, Any] = {}
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set takes section.key=value, not {override!r}")
-        value = value_of(text.strip())
+        value: Any = text.strip()
+        with suppress(tomllib.TOMLDecodeError):  # else a string without quotes
+            value = tomllib.loads(f"value = {value}")["value"]
         for name in reversed(key.strip().split(".")):
             value = {name: value}
         tree = merged(tree, value, one_source=True)
@@ -164,24 +138,6 @@ def merged(weaker: dict[str, Any], stronger: dict[str, Any], *, one_source: bool
     return tree
 
 
-SourcesT = TypeVar("SourcesT", bound=Sources)
-
-
-def read(model: type[SourcesT], overrides: Iterable[str]) -> SourcesT:
-    """A model filled from its sources. Raises ConfigError."""
-    file = model.model_config.get("toml_file")
-    if isinstance(file, Path) and not file.is_file():
-        raise ConfigError(f"no configuration file at {file}")
-    try:
-        return model(**tree_of(overrides))
-    except ValidationError as error:
-        raise ConfigError("; ".join(problems(error, model))) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file} is not TOML: {error}") from None
-
-
 def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Target:
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
@@ -191,22 +147,14 @@ def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Targ
     Raises:
         ConfigError: A source cannot be read, a section is like none of the others, or vehicle or network is wrong.
     """
+    tree = read_sources(file, overrides, keys(Target), OTHER_SECTIONS)
+    sections = (*Target.model_fields, *OTHER_SECTIONS)
+    return valid(Target, {name: each for name, each in tree.items() if closest(name, sections) not in OTHER_SECTIONS})
 
-    class Configured(Target, Sources):
-        model_config = SettingsConfigDict(toml_file=file)
-        loop: Any = None
-        wire: Any = None
-        reference: Any = None
-        law: Any = None
-        controller: Any = None
-        plant: Any = None
-        can: Any = None
-        recorder: Any = None
 
-        @model_validator(mode="before")
-        @classmethod
-        def _without_misspelled_other_sections(cls, tree: dict[str, Any]) -> dict[str, Any]:
-            others = {*cls.model_fields} - {*Target.model_fields}
-            return {key: value for key, value in tree.items() if closest(key, cls.model_fields) not in others}
-
-    return read(Configured, overrides)
+def valid(model: type[ModelT], tree: dict[str, Any], extra: Literal["ignore"] | None = None) -> ModelT:
+    """A model of a tree. Raises ConfigError, with a line for each mistake."""
+    try:
+        return model.model_validate(tree, extra=extra)
+    except ValidationError as error:
+        raise ConfigError("; ".join(problems(error, model))) from None

@@ -17,12 +17,7 @@ _BOUNDS: Final = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to
 
 
 def toml(tree: dict[str, Any], settings: BaseModel | None = None) -> str:
-    """A configuration as TOML.
-
-    Args:
-        tree: The description of the settings.
-        settings: What it describes: then a comment gives each key's description with its unit, and its bounds.
-    """
+    """A description of settings as TOML; with the settings, a comment gives each key's meaning, unit and bounds."""
     document = tomlkit.document()
     _fill(document, tree, settings, {})
     return tomlkit.dumps(document).strip() + "\n"
@@ -57,20 +52,13 @@ def expected(node: dict[str, Any]) -> str:
         return " or ".join(map(json.dumps, choices))
     if options := node.get("anyOf"):
         return " or ".join(filter(None, map(expected, options)))
-    match node.get("type"):
-        case "number" | "integer" as kind:
-            limits = [f" {word} {node[bound]:g}" for bound, word in _BOUNDS.items() if bound in node]
-            return ("whole " if kind == "integer" else "") + "number" + "".join(limits)
-        case "string" if "pattern" in node:
-            return f"string of the form {node['pattern'].strip('^$')}"
-        case "array":
-            items = node.get("prefixItems") or [node.get("items", {})]
-            inner = expected(items[0])
-            most = len(items) if "prefixItems" in node else node.get("maxItems")
-            least = node.get("minItems", 0)
-            count = "list of" if most is None else f"{most} ×" if most == least else f"{least} to {most} ×"
-            return f"{count} {inner}" if inner else ""
-    return ""
+    kind = node.get("type")
+    if kind in ("number", "integer"):
+        limits = [f" {word} {node[bound]:g}" for bound, word in _BOUNDS.items() if bound in node]
+        return ("whole " if kind == "integer" else "") + "number" + "".join(limits)
+    if (items := node.get("prefixItems")) and (inner := expected(items[0])):
+        return f"{len(items)} × {inner}"
+    return f"string of the form {node['pattern'].strip('^$')}" if "pattern" in node else ""
 
 
 def _comment(table: tomlkit.TOMLDocument | Table, text: str) -> None:

@@ -21,10 +21,8 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
-class StreamFigures(BaseModel):
+class StreamFigures(BaseModel, frozen=True):
     """Traffic in one direction, over `duration_s`."""
-
-    model_config = ConfigDict(frozen=True)
 
     frames_per_s: float | None
     bits_per_s: float | None = Field(description="payload bits, padding included")

@@ -6,12 +6,13 @@ Light to import, because every command reads them.
 from __future__ import annotations
 
 import csv
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, Field, ValidationError
 
-from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.errors import ConfigError
 from aeroloop.protocol.messages.operator import Points
 from aeroloop.protocol.wording import problems
 
@@ -56,42 +57,24 @@ class RecorderSettings(BaseModel, extra="forbid"):
     )
 
 
-class PointsError(AeroloopError):
-    """The file cannot be read, or is no table of points; one line with the path."""
-
-
 def read_points(path: Path) -> Points:
     """Attitudes over time from a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
 
     Raises:
-        PointsError: It cannot be read, or is no such table; names the line of a row that is not four numbers.
+        ConfigError: It cannot be read, or is no such table.
     """
-    table: list[list[float]] = []
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file)
-            for i, cells in enumerate(rows):
-                if not cells or (i == 0 and _numbers(cells[:1]) is None):  # a heading
-                    continue
-                numbers = _numbers(cells)
-                if numbers is None or len(numbers) != 4:
-                    raise PointsError(
-                        f"{path}, line {rows.line_num}: expected four numbers (time [s], roll, pitch, yaw [deg]), not "
-                        f"{','.join(cells)!r}"
-                    )
-                table.append(numbers)
-    except UnicodeDecodeError:
-        raise PointsError(f"cannot read {path}: it is not text") from None
-    except (OSError, csv.Error) as error:
-        raise PointsError(f"cannot read {path}: {getattr(error, 'strerror', error)}") from None
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    heading = 1
+    with suppress(ValueError, IndexError):
+        float(rows[0][0])
+        heading = 0
+    table = rows[heading:]
     try:
         return Points.model_validate({"times": [row[0] for row in table], "attitudes": [row[1:] for row in table]})
     except ValidationError as error:
-        raise PointsError(f"{path}: {'; '.join(problems(error, Points))}") from None
-
-
-def _numbers(cells: list[str]) -> list[float] | None:
-    try:
-        return [float(cell) for cell in cells]
-    except ValueError:
-        return None
+        columns = "time [s], roll, pitch, yaw [deg]"
+        raise ConfigError(f"{path}, a table of {columns}: {'; '.join(problems(error, Points))}") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from aeroloop.service.control.laws.interface import (
     voltages_for,
 )
 from aeroloop.service.figures import Figures
-from aeroloop.service.lab import experiment
+from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review import review
 from aeroloop.service.testing.hil import Hil, HilError
@@ -52,37 +52,6 @@ def load_settings(file: Path | str | None = None, overrides: Mapping[str, Any] |
         AeroloopError: What is wrong and where, in one line.
     """
     return load(Path(file) if file is not None else None, as_overrides(overrides or {}))
-
-
-def run_experiment(
-    settings: Settings | None = None,
-    duration_s: float = 50.0,
-    *,
-    plant: Plant | None = None,
-    controller: Controller | None = None,
-    watch: Callable[[int, bytes, bytes], None] | None = None,
-) -> Figures:
-    """Run controller and plant in lockstep in this process; it repeats bit for bit.
-
-    Without `plant`, `controller` and `watch` the whole loop is one compiled function, with the same bits.
-
-    Args:
-        settings: The configuration; the defaults (the paper's experiment at 8 and 6 bits) if None.
-        duration_s: Duration on the law's clock [s].
-        plant: Plant to control; the emulated one of the configuration if None.
-        controller: Controller to run; the configuration's if None.
-        watch: Called at every tick with the tick index, the measurement frame and the command frame; an empty frame
-            is one that was not sent.
-
-    Returns:
-        Figures of merit, such as `z_track` [s] and `u_total` [V²·s].
-
-    Raises:
-        ValueError: The plant tripped, or the configuration makes no loop.
-    """
-    return experiment.run_experiment(
-        settings or load_settings(), duration_s, watch=watch, plant=plant, controller=controller
-    )
 
 
 class RecordedRun(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 
@@ -15,14 +15,13 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from aeroloop.service.config import Settings
-    from aeroloop.service.config_sources import Target
     from aeroloop.service.terminal.show import Sheets
 
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
 PAPER_DURATION_S: Final = 50.0
 
-Result = TypeVar("Result", bound="BaseModel")
+Result = TypeVar("Result")
 
 state = {"debug": False}
 
@@ -62,15 +61,6 @@ Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
 Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown.")]
 NewLog = Annotated[Path | None, typer.Option("--log", help="New log, or its folder.")]
-Require = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--require",
-        metavar="FIGURE=LIMIT",
-        help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped_ticks=0 or "
-        "latency_us.p99=2000; theorem.held=1: unless the run kept to all that is proven.",
-    ),
-]
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -80,40 +70,24 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def report(message: str) -> None:
-    """Print an error as one line on stderr."""
+    """Print one line on stderr."""
     typer.echo(f"aeroloop: {message}", err=True)
 
 
-def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
-    """The effective configuration, with more overrides; a configuration error ends the command."""
+def load_settings(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
+    """The effective configuration, with more overrides."""
     from aeroloop.service.config import load
 
-    with checked():
-        return load(config, [*(overrides or ()), *more])
+    return load(config, [*(overrides or ()), *more])
 
 
-def loop_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
-    """As `settings_of`, for what runs the law: its class is found and has checked its settings."""
-    from aeroloop.service.config import with_law_settings
+def load_for_loop(
+    config: Path | None, overrides: Sequence[str] | None, *more: str, bits: str | None = None
+) -> Settings:
+    """As `load_settings`, for what runs the law: its class is found and has checked its settings."""
+    from aeroloop.service.config import bits_overrides, load
 
-    with checked():
-        return with_law_settings(settings_of(config, overrides, *more))
-
-
-def target_of(config: Path | None, overrides: Sequence[str] | None) -> Target:
-    """Vehicle and network of the effective configuration; a configuration error ends the command."""
-    from aeroloop.service.config_sources import load_target
-
-    with checked():
-        return load_target(config, overrides or ())
-
-
-def with_bits_of(settings: Settings, bits: str | None) -> Settings:
-    """The settings with the bits given on the command line."""
-    from aeroloop.service.config import with_bits
-
-    with checked():
-        return with_bits(settings, bits)
+    return load(config, [*(overrides or ()), *more, *bits_overrides(bits)], runs_law=True)
 
 
 @contextmanager
@@ -131,39 +105,20 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
         fail(problem(error, *models) if isinstance(error, ValidationError) else str(error), 2)
 
 
-@contextmanager
-def working(title: str, json: bool, total: float | None = None) -> Iterator[Callable[..., None]]:
-    """A progress bar: `update(done, total)`. No bar where JSON is printed."""
+def working(title: str, hidden: bool, total: float | None = None) -> AbstractContextManager[Callable[..., None]]:
+    """A progress bar: `update(done, total)`; hidden where JSON is printed."""
     from aeroloop.service.terminal.display import progress_bar
 
-    with progress_bar(title, total, hidden=json) as update:
-        yield update
+    return progress_bar(title, total, hidden=hidden)
 
 
 def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdown: bool = False, keys: int = 1) -> None:
     """Print a result: all of it as JSON, or the tables that a function makes of it."""
     if json:
-        typer.echo(result.model_dump_json(indent=2))
+        from pydantic_core import to_json
+
+        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
     else:
         from aeroloop.service.terminal.show import show_all
 
         show_all(sheets(result), "markdown" if markdown else "terminal", keys)
-
-
-def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
-    """Check where a figure is to be drawn, if one is. Raises as `check_path` and `check_output` do."""
-    if figure is not None:
-        from aeroloop.service.logs.outputs import check_output
-        from aeroloop.service.report.plots import check_path
-
-        check_path(figure)
-        check_output(figure, [config], force=force)
-
-
-@contextmanager
-def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
-    """A path to write to, once the table is printed: a full disk must not cost the table."""
-    from aeroloop.service.logs.outputs import writing
-
-    with writing(path, [config], force=force) as part:
-        yield part

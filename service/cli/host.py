@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from aeroloop.service.cli.common import (
-    Config,
-    Json,
-    Overrides,
-    settings_of,
-    show,
-    working,
-)
+from aeroloop.service.cli.common import Config, Json, Overrides, load_settings, report, show, working
 
 Directory = Annotated[Path, typer.Option("--directory", help="Folder of this host's keys.")]
 DIRECTORY: Final = Path("~/.config/aeroloop/keys")
@@ -34,13 +28,12 @@ def doctor(
     overrides: Overrides = None,
 ) -> None:
     """Check whether this machine holds the configured rate. Checks its certificates, too, and prints what to change."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
     from aeroloop.service.host.doctor import CHECK_S, diagnose
     from aeroloop.service.terminal.sheets import diagnosis_sheets
 
     with working("check", json, CHECK_S) as update:
-        tried = settings.network if network else None
-        diagnosis = diagnose(settings.loop, update, settings.network.security.folder, tried)
+        diagnosis = diagnose(settings.loop, settings.network, update, handshakes=network)
     show(diagnosis, json, diagnosis_sheets, keys=2)
     if not diagnosis.holds:
         raise typer.Exit(1)
@@ -59,7 +52,7 @@ def units(
     from aeroloop.service.host import units
 
     file = config or (units.CONFIG if units.CONFIG.exists() else None)
-    source = units.Source(file or units.CONFIG, overrides or [], settings_of(file, overrides))
+    source = units.Source(file or units.CONFIG, overrides or [], load_settings(file, overrides))
     if install is None:
         for name in units.units_of(source.settings):
             typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
@@ -78,11 +71,8 @@ def init(directory: Directory = DIRECTORY) -> None:
 
     folder = directory.expanduser().absolute()
     typer.echo(keys.init(folder))
-    typer.echo(
-        f"next: `aeroloop host keys issue ROLE NAME`, and in every configuration [network.security] directory = "
-        f'"{folder}"',
-        err=True,
-    )
+    directory_key = f'[network.security] directory = "{folder}"'
+    report(f"next: `aeroloop host keys issue ROLE NAME`, and in every configuration {directory_key}")
 
 
 @keys.command()
@@ -104,17 +94,10 @@ def issue(
 def show_keys(json: Json = False, directory: Directory = DIRECTORY) -> None:
     """Print this host's certificates and their authority. Exits with 1 if one cannot be used."""
     from aeroloop.service.host import keys
+    from aeroloop.service.terminal.sheets import key_sheets
 
     folder = directory.expanduser().absolute()
     files = keys.show(folder)
-    if json:
-        from json import dumps
-
-        typer.echo(dumps([file.model_dump(mode="json") for file in files], indent=2))
-    else:
-        from aeroloop.service.terminal.sheets import key_sheets
-        from aeroloop.service.terminal.show import show_all
-
-        show_all(key_sheets(str(folder), files), keys=2)
+    show(files, json, partial(key_sheets, str(folder)), keys=2)
     if any(file.problem for file in files):
         raise typer.Exit(1)

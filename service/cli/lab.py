@@ -18,13 +18,10 @@ from aeroloop.service.cli.common import (
     Json,
     Markdown,
     Overrides,
-    check_figure,
     checked,
-    loop_of,
-    new_file,
+    load_for_loop,
     report,
     show,
-    with_bits_of,
     working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
@@ -48,7 +45,7 @@ def experiment(
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, without a network."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.log_sheets import figure_sheets
 
@@ -65,7 +62,7 @@ def tables(
     overrides: Overrides = None,
 ) -> None:
     """Predict the paper's Tables C.2 to C.4. Beside the published values."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.tables import predict, sheets
 
     with working("cells", json) as update:
@@ -76,7 +73,7 @@ def tables(
 def certify(
     disturbance: Annotated[
         float | None,
-        typer.Option(min=0, help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it."),
+        typer.Option(min=0, help="Largest torque beyond the plant's settings, in N·m; a machine needs it."),
     ] = None,
     bits: BitsOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
@@ -85,28 +82,24 @@ def certify(
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven, and what that assumes. Exits with 1 unless all of it holds."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.terminal.sheets import certificate_sheets
-    from aeroloop.service.theorem import certificate
+    from aeroloop.service.theorem.certificate import certify
 
-    result = certificate.certify(settings, disturbance=disturbance)
+    result = certify(settings, disturbance=disturbance)
     show(result, json, partial(certificate_sheets, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 
 
 def burden(
     bits: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; may be repeated; six pairs if left out."
-        ),
+        list[str] | None, typer.Option(metavar="OUT/IN", help="Such as 8/6; may be repeated; six pairs if left out.")
     ] = None,
     quantizer: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KIND",
             help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
-            "the rest); may be repeated; all four if left out.",
+            "the rest); may be repeated; all four if left out."
         ),
     ] = None,
     duration: Duration = PAPER_DURATION_S,
@@ -119,28 +112,29 @@ def burden(
     overrides: Overrides = None,
 ) -> None:
     """Measure error against bits, for every quantizer and sensor. Sent on change and at every tick."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.burden import draw_burden, grid, measure_burden, sheets
+    from aeroloop.service.logs.outputs import check_output, writing
 
     with checked():
-        check_figure(figure, config, force)
+        if figure is not None:
+            from aeroloop.service.report.plots import check_path
+
+            check_path(figure)
+        check_output(figure, [config], force=force)
         cells = grid(settings, bits or (), quantizer or ())
     with working("experiments", json) as update:
         result = measure_burden(settings, cells, duration, update, engine)
     show(result, json, sheets, markdown, keys=2)
-    if figure is not None:
-        with new_file(figure, config, force) as part:
+    if figure is not None:  # after the table: a full disk must not cost it
+        with writing(figure, [config], force=force) as part:
             draw_burden(result, part)
 
 
 def laws(
     law: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KIND",
-            help="A kind of law: ours, or package.module:Class; may be repeated; ours if left out. "
-            "One that adapts is shown without adaptation, too.",
-        ),
+        typer.Option(help="A law.kind; may be repeated; ours if left out. One that adapts is shown without that, too."),
     ] = None,
     seeds: _Seeds = 5,
     duration: Duration = PAPER_DURATION_S,
@@ -152,11 +146,10 @@ def laws(
     overrides: Overrides = None,
 ) -> None:
     """Compare control laws, tuned alike. Proven bound, error, effort, chatter, bits, delay and loss survived."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.laws import compare, compared_laws, sheets
 
-    with checked():
-        compared = compared_laws(settings, law or ())
+    compared = compared_laws(settings, law or ())
     with working("experiments and searches", json) as update:
         result = compare(settings, compared, seeds=seeds, duration_s=duration, engine=engine, progress=update)
     show(result, json, sheets, markdown)
@@ -168,9 +161,8 @@ def sweep(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
-            help="section.key=a,b,c, also of lists: law.C2=[1,1,1],[2,2,2]; or section.key=a..b*n, n values evenly "
-            "from a to b; section.key*=VALUES has factors of what is configured: law.C2*=0.5,1,2. May be repeated, "
-            "for every combination.",
+            help="section.key=a,b,c, or a..b*n, n values evenly from a to b; section.key*=VALUES has factors of what "
+            "is configured: law.C2*=0.5,1,2. May be repeated, for every combination.",
         ),
     ] = None,
     seeds: _Seeds = 1,
@@ -183,13 +175,13 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds. Writes a table of their figures."""
-    settings = with_bits_of(loop_of(config, overrides), bits)
+    settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, rows_file, run_sweep, sheets
 
+    axes = parse_axes(vary or ())
+    planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
     with checked():
-        axes = parse_axes(vary or ())
-        planned = SweepPlan(settings, axes, configurations(settings, axes, seeds, duration), seeds, duration)
         check_table(out, [config], force=force)
     with working("experiments", json) as update:
         try:
@@ -203,15 +195,10 @@ def sweep(
 def tune(
     gain: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Gain, or other number of the law's settings; may be repeated; all of the law's gains if left out.",
-        ),
+        typer.Option(help="Gain, or other number of [law]; may be repeated; all of the law's gains if left out."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds, each calm and in wind.")] = 2,
-    held_out: Annotated[
-        int, typer.Option(min=1, max=100, help="Runs with other seeds and winds, which the search does not see.")
-    ] = 4,
+    held_out: Annotated[int, typer.Option(min=1, max=100, help="Runs with seeds and winds not searched.")] = 4,
     budget: Annotated[int, typer.Option(min=1, help="Experiments of the search, at most.")] = 1000,
     duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 10.0,
     out: Annotated[Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.")] = None,
@@ -226,33 +213,28 @@ def tune(
     What is minimised is the mean of z_track + 1e-7·u_total, by one factor for each gain, up to 10 either way. Gains
     with which a run trips, or a voltage changes over 1.25 times as often as with the configured ones, do not count.
     """
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab.engine import open_workers
     from aeroloop.service.lab.tune import TuneOptions, sheets, toml_of, tune
-    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.logs.outputs import check_output, writing
 
     with checked():
-        if out is not None:
-            check_output(out, [config], force=force)
+        check_output(out, [config], force=force)
     options = TuneOptions(gain or (), seeds, held_out, budget, duration)
     with working("experiments", json) as update, open_workers(engine) as workers:
         found = tune(settings, options, workers, update)
     show(found, json, sheets)
     if out is not None:
-        with new_file(out, config, force) as part:
+        with writing(out, [config], force=force) as part:
             part.write_text(toml_of(found), encoding="utf-8")
     raise typer.Exit(INTERRUPTED if found.interrupted else int(found.worse))
 
 
 def design(
     error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
-    kbit: Annotated[
-        float | None,
-        typer.Option(min=0, metavar="KBIT", help="Largest payload of both frames, in kbit/s."),
-    ] = None,
+    kbit: Annotated[float | None, typer.Option(min=0, help="Largest payload of both frames, in kbit/s.")] = None,
     rates: Annotated[
-        list[float] | None,
-        typer.Option("--rate", metavar="HZ", help="Rate; may be repeated; as configured if left out."),
+        list[float] | None, typer.Option("--rate", help="Rate, in Hz; may be repeated; as configured if left out.")
     ] = None,
     delay: Annotated[float, typer.Option(min=0, metavar="S", help="Further delay of every command, in s.")] = 0.0,
     loss: Annotated[int, typer.Option(min=0, metavar="N", help="Most frames lost in a row.")] = 0,
@@ -264,7 +246,7 @@ def design(
     overrides: Overrides = None,
 ) -> None:
     """Search bits and rate for the least payload. Its attitude error is proven."""
-    settings = loop_of(config, overrides)
+    settings = load_for_loop(config, overrides)
     from aeroloop.service.lab import design as lab
 
     with working("experiments", json) as update:

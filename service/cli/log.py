@@ -9,27 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from aeroloop.service.cli.common import (
-    Config,
-    Force,
-    Json,
-    Overrides,
-    Require,
-    checked,
-    fail,
-    settings_of,
-    show,
-    working,
-)
+from aeroloop.service.cli.common import Config, Force, Json, Overrides, fail, load_settings, report, show, working
 from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
     from threading import Event
 
-    from aeroloop.service.logs.copies import Recovery
-    from aeroloop.service.logs.export import Exported
     from aeroloop.service.review.report import Report
-    from aeroloop.service.terminal.show import Sheets
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.")]
 Html = Annotated[Path | None, typer.Option("--html", help="Write an interactive page that needs no network.")]
@@ -39,11 +25,18 @@ Vehicle = Annotated[
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
 Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
 
+Require = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--require",
+        metavar="FIGURE=LIMIT",
+        help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped_ticks=0 or "
+        "latency_us.p99=2000; theorem.held=1: unless the run kept to all that is proven.",
+    ),
+]
+
 LIVE_HZ: Final = 30.0
 """Messages a second of each topic to a viewer."""
-
-SESSIONS_SHOWN = 9
-"""Sessions that `log export` leaves out and names."""
 
 group = typer.Typer()
 
@@ -66,30 +59,25 @@ def review(
     json: Json = False,
 ) -> None:
     """Compute every figure of a run from its logs. Checks limits, and draws the paper's figures."""
+    from aeroloop.service.logs.outputs import check_output, writing_into
     from aeroloop.service.review.requirements import Limit, broken_limits
-
-    with checked():
-        limits = [Limit.parse(text) for text in require or []]
-    _check_page(html, logs, force)
-
-    from aeroloop.service.logs.outputs import writing_into
     from aeroloop.service.review.review import read
-    from aeroloop.service.terminal.display import progress_bar
     from aeroloop.service.terminal.log_sheets import review_sheets
 
+    limits = [Limit.parse(text) for text in require or []]
+    check_output(html, logs, force=force)
     _check_part(since_s, until_s)
-    with progress_bar("reading", 1, hidden=json) as update:
+    with working("reading", json, 1) as update:
         judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
     if figures is not None:
         from aeroloop.service.report.plots import draw_figures
 
-        drawing = progress_bar("drawing", 1, hidden=json)
-        with writing_into(figures, logs, force=force) as folder, drawing as update:
+        with writing_into(figures, logs, force=force) as folder, working("drawing", json, 1) as update:
             drawn = draw_figures(judged.report(), judged.settings, folder, update)
         names = ", ".join(dict.fromkeys(path.stem for path in drawn))
-        typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
+        report(f"drew {names} into {figures}, as PDF, SVG and PNG")
     if html is not None:
-        write_html([judged.report(limits)], html, logs, force)
+        _write_page([judged.report(limits)], html, logs, force)
     findings = judged.checked(limits)
     show(findings, json, review_sheets)
     if broken := broken_limits(findings):
@@ -105,22 +93,19 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare figures and configurations of several runs."""
-    from aeroloop.service.review.requirements import Limit, broken_limits
-
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
-    with checked():
-        limits = [Limit.parse(text) for text in require or []]
-    _check_page(html, logs, force)
-
+    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.review.requirements import Limit, broken_limits
     from aeroloop.service.review.review import Comparison, read_runs
-    from aeroloop.service.terminal.display import progress_bar
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 
-    with progress_bar("reading", 1, hidden=json) as update:
+    limits = [Limit.parse(text) for text in require or []]
+    check_output(html, logs, force=force)
+    with working("reading", json, 1) as update:
         reports = read_runs(logs, limits, update)
     if html is not None:
-        write_html(reports, html, logs, force)
+        _write_page(reports, html, logs, force)
     show(Comparison.of(reports), json, lambda _: comparison_sheets(reports))
     if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
@@ -131,22 +116,13 @@ def _check_part(since_s: float, until_s: float) -> None:
         fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
 
 
-def _check_page(out: Path | None, logs: Sequence[Path], force: bool) -> None:
-    """Check, before the logs are read, that their page may be written; else the command ends."""
-    if out is not None:
-        from aeroloop.service.logs.outputs import check_output
-
-        check_output(out, logs, force=force)
-
-
-def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
-    """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
+def _write_page(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     from aeroloop.service.logs.outputs import writing
     from aeroloop.service.report.page import page
 
     with writing(out, logs, force=force) as part:
         part.write_text(page(reports), encoding="utf-8")
-    typer.echo(f"aeroloop: wrote {out}", err=True)
+    report(f"wrote {out}")
 
 
 @group.command()
@@ -181,14 +157,11 @@ def recover(
 ) -> None:
     """Copy what is whole of a broken log into a new one. Reports what was lost."""
     from aeroloop.service.logs.copies import recover
-
-    def sheets(recovery: Recovery) -> Sheets:
-        found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"
-        yield "\n".join([found, *(f"not recovered, {line}" for line in recovery.lost)]), []
+    from aeroloop.service.terminal.log_sheets import recovery_sheets
 
     with working("recovering", json, 1) as update:
         recovery = recover(broken, out, update, force=force)
-    show(recovery, json, sheets)
+    show(recovery, json, recovery_sheets)
 
 
 @group.command()
@@ -199,7 +172,7 @@ def live(
     overrides: Overrides = None,
 ) -> None:
     """Serve a running loop to Foxglove or Lichtblick until ^C. It is a WebSocket."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
     vehicle = settings.vehicle
 
     def ready(url: str) -> None:
@@ -232,30 +205,12 @@ def export(
 ) -> None:
     """Write a log as a table with a row for each tick. With --format mcap: a log with every message decoded."""
     from aeroloop.service.logs.export import export
-
-    def sheets(exported: Exported) -> Sheets:
-        if exported.sessions is None:
-            found = f"{exported.rows} messages on {len(exported.columns)} channels"
-        else:
-            found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
-        lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
-        if others := exported.left_out:
-            more = f" and {len(others) - SESSIONS_SHOWN} more" if len(others) > SESSIONS_SHOWN else ""
-            names = ", ".join(others[:SESSIONS_SHOWN]) + more
-            lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
-        yield "\n".join([f"{exported.out}: {found}", *lines]), []
+    from aeroloop.service.terminal.log_sheets import export_sheets
 
     _check_part(since_s, until_s)
     with working("exporting", json, 1) as update:
         exported = export(
-            logs,
-            form,
-            out,
-            session=session,
-            vehicle=vehicle,
-            since_s=since_s,
-            until_s=until_s,
-            force=force,
+            logs, form, out, session=session, vehicle=vehicle, since_s=since_s, until_s=until_s, force=force,
             progress=update,
-        )
-    show(exported, json, sheets)
+        )  # fmt: skip
+    show(exported, json, export_sheets)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, target_of
+from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, report, show
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,16 +29,22 @@ Within = Annotated[
 group = typer.Typer()
 
 
+def _target(config: Path | None, overrides: Sequence[str] | None) -> tuple[Target, str | None]:
+    """Network of the configuration, and the vehicle if one is configured."""
+    from aeroloop.service.config_sources import load_target
+
+    target = load_target(config, overrides or ())
+    return target, target.vehicle if "vehicle" in target.model_fields_set else None
+
+
 @group.command()
 def status(
     check: Annotated[
         bool,
         typer.Option(
             "--check",
-            help="Print only what is wrong, and exit with 1 if anything is: a plant tripped or a controller faulted; a "
-            "role silent for 3 s; a loop late (over 1 % of the last 10 s' ticks skipped, or commands that take over a "
-            "period at the 99th percentile); a controller or plant missing, or a recorder that was there or is "
-            "required; messages that a recorder lost; a plant that cannot keep a stop on disk.",
+            help="Print only what is wrong, and exit with 1 if anything is: tripped, faulted, silent for 3 s, missing, "
+            "late (1 % of ticks skipped, or commands over a period at p99), messages lost, a stop not kept on disk.",
         ),
     ] = False,
     json: Json = False,
@@ -46,41 +52,32 @@ def status(
     overrides: Overrides = None,
 ) -> None:
     """Print the status of the vehicle's roles, of all if none is set. Exits with 1 if no role answers."""
-    target = target_of(config, overrides)
+    target, vehicle = _target(config, overrides)
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
+    from aeroloop.service.terminal.roles import status_sheets, trouble_sheets
 
     found = gather(target.network)
-    if "vehicle" in target.model_fields_set:
-        if target.vehicle not in found.statuses:
-            fail(f"no role of {target.vehicle} answers, only of {', '.join(sorted(found.statuses))}", 1)
-        found = found._replace(statuses={target.vehicle: found.statuses[target.vehicle]})
-    well = not check or not troubles(found)
-    if json:
-        from json import dumps
-
-        tree: dict[str, object] = {
-            vehicle: {role: status.model_dump(mode="json") for role, status in roles.items()}
-            for vehicle, roles in found.statuses.items()
-        }
-        if check:
-            tree = {"well": well, "troubles": [trouble._asdict() for trouble in troubles(found)], "vehicles": tree}
-        typer.echo(dumps(tree, indent=2))
-    else:
-        from aeroloop.service.terminal.roles import status_sheets, trouble_sheets
-        from aeroloop.service.terminal.show import show_all
-
-        show_all(trouble_sheets(found) if check else status_sheets(found))
-    for line in [] if check else found.silent:
-        typer.echo(f"aeroloop: {line}", err=True)
-    if not well:
+    if vehicle is not None:
+        if vehicle not in found.statuses:
+            fail(f"no role of {vehicle} answers, only of {', '.join(sorted(found.statuses))}", 1)
+        found = found._replace(statuses={vehicle: found.statuses[vehicle]})
+    if not check:
+        show(found.statuses, json, lambda _: status_sheets(found))
+        for line in found.silent:
+            report(line)
+        return
+    wrong = troubles(found)
+    tree = {"well": not wrong, "troubles": [trouble._asdict() for trouble in wrong], "vehicles": found.statuses}
+    show(tree, json, lambda _: trouble_sheets(found, wrong))
+    if wrong:
         raise typer.Exit(1)
 
 
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
     """Show every vehicle and role on the network, live; ^C quits."""
-    target = target_of(config, overrides)
+    target, _ = _target(config, overrides)
     from aeroloop.service.terminal.monitor import watch
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which restores the terminal, as ^C does
@@ -90,7 +87,7 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant for the next claim. Controllers that hold or are faulted claim again."""
-    _send(target_of(config, overrides), "arm")
+    _send(config, overrides, "arm")
 
 
 @group.command()
@@ -100,11 +97,10 @@ def stop(
     overrides: Overrides = None,
 ) -> None:
     """Stop the vehicle's plant at once: 0 V until `op arm`. All plants if no vehicle is configured."""
-    target = target_of(config, overrides)
+    target, vehicle = _target(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
-    configured = "vehicle" in target.model_fields_set
-    answers, failures = stop_plants(target.network, target.vehicle if configured and not every else None)
+    answers, failures = stop_plants(target.network, None if every else vehicle)
     for line in answers:
         typer.echo(line)
     if failures:
@@ -114,7 +110,7 @@ def stop(
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle, for another one. It holds until `op arm`."""
-    _send(target_of(config, overrides), "stand_down")
+    _send(config, overrides, "stand_down")
 
 
 @group.command()
@@ -134,44 +130,37 @@ def inject(
     from aeroloop.plant_emulator.faults.language import Fault
     from aeroloop.protocol.messages.operator import Inject
 
-    target = target_of(config, overrides)
     if not (faults or clear):
         fail("name a fault, such as rate:off@1..2, or give --clear", 2)
     with checked():
         message = Inject(faults=[str(Fault.parse(text)) for text in faults or ()], clear=clear)
-    _send(target, "inject", message)
+    _send(config, overrides, "inject", message)
 
 
 @group.command("set-gains", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def set_gains(context: typer.Context, config: Config = None, overrides: Overrides = None) -> None:
     """Change gains of the law between two ticks. Each is --NAME and its numbers: --C2 0.2 0.2 0.2; others stay."""
-    target = target_of(config, overrides)
-    _send(target, "set_gains", gains_from(context.args))
+    _send(config, overrides, "set_gains", _gains(context.args))
 
 
-def gains_from(words: Sequence[str]) -> Gains:
-    """Gains given as --NAME and numbers; anything else ends the command."""
+def _gains(words: Sequence[str]) -> Gains:
     from aeroloop.protocol.messages.operator import Gains
 
-    how = "give each gain as --NAME and its numbers, such as --C2 0.2 0.2 0.2"
-    given: dict[str, list[str]] = {}
-    numbers: list[str] | None = None
-    for word in words:
-        if word.startswith("--"):
-            name, equals, value = word[2:].partition("=")
-            numbers = given[name] = [value] if equals else []
-        elif numbers is None:
-            fail(f"{how}, not {word!r}", 2)
-        else:
-            numbers.append(word)
-    if not all(given.values()) or not given:
-        fail(how, 2)
+    given: dict[str, list[float]] = {}
+    name = ""
     try:
-        floats = {name: [float(number) for number in numbers] for name, numbers in given.items()}
-    except ValueError:
-        fail(how, 2)
+        for word in words:
+            if word.startswith("--"):
+                name, equals, value = word[2:].partition("=")
+                given[name] = [float(value)] if equals else []
+            else:
+                given[name].append(float(word))
+    except (KeyError, ValueError):
+        given = {}
+    if not given or not all(given.values()):
+        fail("give each gain as --NAME and its numbers, such as --C2 0.2 0.2 0.2", 2)
     with checked(Gains):
-        return Gains.model_validate(floats)
+        return Gains.model_validate(given)
 
 
 @group.command(context_settings={"ignore_unknown_options": True})  # a negative angle is no option
@@ -186,10 +175,9 @@ def goto(
     """Brake, turn to an attitude and hold it."""
     from aeroloop.protocol.messages.operator import Hold, Track
 
-    target = target_of(config, overrides)
     with checked(Track, Hold):
         track = Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s)
-    _send(target, "track", track)
+    _send(config, overrides, "track", track)
 
 
 @group.command()
@@ -212,34 +200,31 @@ def track(
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.settings import read_points
 
-    target = target_of(config, overrides)
     options = {name: each for name, each in (("amplitude", amplitude), ("frequency", frequency)) if each is not None}
     if options and what != "sinusoid":
         fail(f"{what} takes no option but --in", 2)
     with checked(Sinusoid, Track):
         reference: Reference | None
         match what:
-            case "sinusoid":
-                reference = Sinusoid.model_validate(options)
-            case "hold" | "stream":
-                reference = Hold() if what == "hold" else Stream()
             case "configured":
                 reference = None
+            case "sinusoid":
+                reference = Sinusoid.model_validate(options)
+            case "hold":
+                reference = Hold()
+            case "stream":
+                reference = Stream()
             case _:
                 reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
-    _send(target, "track", message)
+    _send(config, overrides, "track", message)
 
 
-def _send(target: Target, topic: str, message: Message | None = None) -> None:
+def _send(config: Path | None, overrides: Sequence[str] | None, topic: str, message: Message | None = None) -> None:
+    """Send a request to the configured vehicle, else to the only one on the network; print the answer."""
+    target, vehicle = _target(config, overrides)
     from aeroloop.protocol.messages.operator import Request
-    from aeroloop.service.host.operator import send
+    from aeroloop.service.host.operator import only_vehicle, send
 
-    typer.echo(send(target.network, _vehicle(target), topic, message or Request()))
-
-
-def _vehicle(target: Target) -> str:
-    """The configured vehicle, else the only one on the network; OperatorError if there are several."""
-    from aeroloop.service.host.operator import only_vehicle
-
-    return target.vehicle if "vehicle" in target.model_fields_set else only_vehicle(target.network) or target.vehicle
+    vehicle = vehicle or only_vehicle(target.network) or target.vehicle
+    typer.echo(send(target.network, vehicle, topic, message or Request()))

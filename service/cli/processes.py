@@ -6,13 +6,10 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from threading import Event, Thread
 from typing import TYPE_CHECKING
 
-from aeroloop.service.cli.entry import end_unstarted
-
 if TYPE_CHECKING:
-    from threading import Event
-
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
 
@@ -45,11 +42,8 @@ def _stop_on_signals() -> tuple[Event, Event]:
     """Log to stderr, and return events: one to set once the process has begun, one that a signal to stop sets.
 
     Before the process has begun, a signal ends it. Why a thread waits for signals: a handler would run in the main
-    thread, where Zenoh may be waiting for a peer, and which may hold the lock of the event that the handler sets: then
-    the process would never end.
+    thread, which may wait in Zenoh, or hold the lock of the event that the handler sets: it would never end.
     """
-    from threading import Event, Thread
-
     handler = logging.StreamHandler()
     line = "%(asctime)s %(levelname)s %(role)s: %(message)s"
     handler.setFormatter(logging.Formatter(line, defaults={"role": "aeroloop"}))
@@ -62,7 +56,8 @@ def _stop_on_signals() -> tuple[Event, Event]:
     def wait() -> None:
         signal.sigwait(signals)
         if not begun.is_set():
-            end_unstarted()
+            os.write(2, b"aeroloop: ended by a signal before it had started\n")
+            os._exit(0)
         stop.set()
 
     Thread(target=wait, daemon=True).start()

@@ -18,10 +18,10 @@ from aeroloop.service.cli.common import (
     Json,
     NewLog,
     Overrides,
-    loop_of,
-    settings_of,
+    load_for_loop,
+    load_settings,
+    report,
     show,
-    with_bits_of,
     working,
 )
 from aeroloop.service.cli.entry import INTERRUPTED
@@ -46,7 +46,7 @@ def demo(
     overrides: Overrides = None,
 ) -> None:
     """Run the paper's experiment in three processes over Zenoh. Then review its log."""
-    settings = with_bits_of(loop_of(config, overrides, *(["loop.lockstep=true"] if lockstep else [])), bits)
+    settings = load_for_loop(config, overrides, *["loop.lockstep=true"] * lockstep, bits=bits)
     from aeroloop.service.lab.demo import run_demo
     from aeroloop.service.terminal.display import demo_progress
     from aeroloop.service.terminal.log_sheets import demo_sheets
@@ -54,13 +54,13 @@ def demo(
     hidden = json or not sys.stderr.isatty()
     if hidden:
         how = "in lockstep" if settings.loop.lockstep else "in real time"
-        typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
+        report(f"{duration:g} s of the experiment {how}, three processes")
     with working("starting", hidden, duration) as update:
         figures, complete = run_demo(settings, duration, log, None if hidden else demo_progress(settings, update))
     show(figures, json, demo_sheets)
     if not json:
-        page = quote(str(Path(figures.log or "").with_suffix(".html")))
-        typer.echo(f"aeroloop: next, draw it: `aeroloop log review {quote(figures.log or '')} --html {page}`", err=True)
+        page = Path(figures.log or "").with_suffix(".html")
+        report(f"next, draw it: `aeroloop log review {quote(figures.log or '')} --html {quote(str(page))}`")
     if not complete:
         raise typer.Exit(INTERRUPTED)
 
@@ -74,7 +74,7 @@ def controller(
     overrides: Overrides = None,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
-    settings = loop_of(config, overrides, *(["controller.auto_arm=true"] if auto_arm else []))
+    settings = load_for_loop(config, overrides, *["controller.auto_arm=true"] * auto_arm)
 
     def run(role: Node) -> None:
         from aeroloop.service.control.laws.registry import version_of
@@ -92,7 +92,7 @@ def controller(
 @group.command()
 def plant(config: Config = None, overrides: Overrides = None) -> None:
     """Run the plant end that `plant.via` names until SIGTERM. It is the emulator, a CAN bridge or Quanser's board."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
     from aeroloop.service.daemon.roles import run_plant
 
     run_role("plant", settings, lambda role: run_plant(role, settings))
@@ -101,7 +101,7 @@ def plant(config: Config = None, overrides: Overrides = None) -> None:
 @group.command("can-node")
 def can_node(config: Config = None, overrides: Overrides = None) -> None:
     """Run the emulated plant as a node on the CAN bus."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
@@ -117,7 +117,7 @@ def can_node(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def router(config: Config = None, overrides: Overrides = None) -> None:
     """Run a router for clients until SIGTERM. They have network.mode = "client"."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
     from aeroloop.service.daemon.roles import run_router
 
     run_role("router", settings, run_router)
@@ -127,7 +127,7 @@ def router(config: Config = None, overrides: Overrides = None) -> None:
 def recorder(log: NewLog = None, config: Config = None, overrides: Overrides = None) -> None:
     """Record every vehicle on the network into a log until SIGTERM."""
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
-    settings = settings_of(config, overrides, *words)
+    settings = load_settings(config, overrides, *words)
     from aeroloop.service.recording.recorder import Recorder
 
     run_role("recorder", settings, lambda role: Recorder(role, settings.recorder).run())

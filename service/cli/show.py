@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aeroloop.service.cli.common import Config, Overrides, checked, fail, loop_of, settings_of
+from aeroloop.service.cli.common import Config, Overrides, checked, fail, load_for_loop, load_settings
 
 if TYPE_CHECKING:
     from aeroloop.service.config import Settings
@@ -32,10 +32,10 @@ def show_config(
     from aeroloop.service.config import with_law_settings
 
     if check:
-        _check(loop_of(config, overrides))
+        _check(load_for_loop(config, overrides))
         return
-    settings = settings_of(config, overrides)
-    with checked(), suppress(PluginError):  # a class that is not on this host: its keys as they are written
+    settings = load_settings(config, overrides)
+    with suppress(PluginError):  # a class that is not on this host: its keys as they are written
         settings = with_law_settings(settings)
     typer.echo(settings.toml(comments=True), nl=False)
 
@@ -81,13 +81,13 @@ def spec(config: Config = None, overrides: Overrides = None) -> None:
     from aeroloop.service.terminal.sheets import wire_sheets
     from aeroloop.service.terminal.show import show_all
 
-    show_all(wire_sheets(settings_of(config, overrides).wire))
+    show_all(wire_sheets(load_settings(config, overrides).wire))
 
 
 @group.command()
 def dbc(config: Config = None, overrides: Overrides = None) -> None:
     """Print the DBC file of the configured wire and CAN node."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
 
     from aeroloop.service.viewers.dbc import dbc as describe
 
@@ -99,7 +99,7 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def layout(config: Config = None, overrides: Overrides = None) -> None:
     """Print a layout for Foxglove or Lichtblick. It shows a log or `log live`."""
-    settings = settings_of(config, overrides)
+    settings = load_settings(config, overrides)
 
     from aeroloop.service.viewers.schemas import layout as describe
 

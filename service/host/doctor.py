@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, Field
@@ -53,26 +52,23 @@ class Diagnosis(BaseModel, frozen=True):
 
 def diagnose(
     loop: LoopSettings,
+    network: NetworkSettings,
     progress: Callable[[float], None] | None = None,
-    keys: Path | None = None,
-    network: NetworkSettings | None = None,
+    *,
+    handshakes: bool = False,
 ) -> Diagnosis:
     """Check the settings and certificates, then run the trial.
 
     Args:
         loop: The rate, and how the daemons are set up.
+        network: Where this host's certificates are.
         progress: Called five times a second with the trial's elapsed time [s].
-        keys: Directory of this host's certificates; None if there is none.
-        network: Where to try the certificates; None: nowhere.
+        handshakes: Whether to try the certificates at each configured place, too.
 
     Raises:
         NetworkError, CertificateError: The network's links cannot be secured.
     """
-    findings = [
-        *_settings(),
-        *(certificate_findings(keys) if keys else ()),
-        *(network_findings(network) if network else ()),
-    ]
+    findings = [*_settings(), *certificate_findings(network), *(network_findings(network) if handshakes else ())]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     if not refusals:
         findings.append(Finding("real-time set-up", True, "SCHED_FIFO, locked memory, awake CPUs"))
@@ -98,17 +94,16 @@ def diagnose(
         f"want at most {100 * LATE_SHARE:g} % skipped and {limit_us:.0f} µs: lower loop.rate_hz, free or isolate a CPU "
         "(loop.cpus), or use a kernel with PREEMPT_RT",
     )
-    return Diagnosis(
-        holds=trial.good, rate_hz=loop.rate_hz, skipped=grid.skipped, wake_us=wake, findings=[*findings, trial]
-    )
+    findings.append(trial)
+    return Diagnosis(holds=trial.good, rate_hz=loop.rate_hz, skipped=grid.skipped, wake_us=wake, findings=findings)
 
 
-def certificate_findings(directory: Path) -> Iterator[Finding]:
-    """The authority and this host's certificates: whether they can be used, and for how long."""
+def certificate_findings(network: NetworkSettings) -> Iterator[Finding]:
+    """The authority and this host's certificates, if there are any: whether they can be used, and for how long."""
     from aeroloop.service.host.keys import show  # imports `cryptography`
 
     try:
-        rows = show(directory)
+        rows = show(network.security.folder) if network.security.folder else []
     except CertificateError as error:
         yield Finding("certificates", False, "no authority", str(error))
         return
@@ -138,30 +133,22 @@ def network_findings(network: NetworkSettings) -> Iterator[Finding]:
         answering = accepting([str(each) for each in Endpoint.parse(place).ports(PORTS if several else 1)])
         tries = [(port, certificate) for port in answering for certificate in usable]
         with ThreadPoolExecutor(max(1, len(tries))) as pool:
-            lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))
+            lines = pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries)
         refused = [(port, each.file.name, line) for (port, each), line in zip(tries, lines, strict=True) if line]
         for port, name, line in refused:
             yield Finding(name, False, f"refused at {port}", line)
         if not answering:
             yield Finding(place, False, "no process answers", "start one there, and let TCP through to it")
         elif not refused:
-            yield Finding(
-                place, True, "answers" + (f", and refuses none of {len(usable)} certificates" if usable else "")
-            )
+            them = f", and refuses none of {len(usable)} certificates" if usable else ""
+            yield Finding(place, True, f"answers{them}")
 
 
 def _settings() -> Iterator[Finding]:
     """The kernel's settings, as far as the trial's own set-up does not show them."""
     clock, governor = map(host_facts().get, ("clock", "governor"))
-    yield Finding(
-        "clock source",
-        clock in GOOD_CLOCKS,
-        clock or "not reported by this kernel",
-        "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
-    )
-    yield Finding(
-        "CPU frequency",
-        governor in (None, "performance"),
-        governor or "not scaled by this kernel",
-        "set the governor to performance: cpupower frequency-set -g performance",
-    )
+    slow = "reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one"
+    yield Finding("clock source", clock in GOOD_CLOCKS, clock or "not reported by this kernel", slow)
+    scaled = "set the governor to performance: cpupower frequency-set -g performance"
+    good = governor in (None, "performance")
+    yield Finding("CPU frequency", good, governor or "not scaled by this kernel", scaled)

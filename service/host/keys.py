@@ -16,12 +16,7 @@ from typing import Final, cast
 from uuid import uuid4
 
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric.ec import (
-    SECP256R1,
-    EllipticCurvePrivateKey,
-    EllipticCurvePublicKey,
-    generate_private_key,
-)
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -80,7 +75,7 @@ def init(directory: Path) -> Path:
     except OSError as error:
         raise CertificateError(f"cannot make {directory}: {error.strerror}") from None
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"aeroloop authority {uuid4().hex[:8]}")])
-    key, until = generate_private_key(SECP256R1()), datetime.now(UTC) + timedelta(days=AUTHORITY_DAYS)
+    key, until = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC) + timedelta(days=AUTHORITY_DAYS)
     made = _signed(key, name, name, key.public_key(), until, authority=True)
     return _write_pair(directory / AUTHORITY, directory / KEY, made, key)
 
@@ -88,11 +83,7 @@ def init(directory: Path) -> Path:
 def issue(directory: Path, role: str, name: str, vehicle: str | None = None) -> Path:
     """Make a key and its certificate for a role, for `DAYS`. Returns the certificate's file, `ROLE.VEHICLE.pem`.
 
-    Args:
-        directory: Where the authority's key is.
-        role: One of `ROLES`.
-        name: Host or person that gets it.
-        vehicle: Its vehicle; None is every one.
+    `name` is the host or person that gets it; a vehicle of None is every one.
 
     Raises:
         CertificateError: Role, name or vehicle will not do; a file exists; the authority's key is not here.
@@ -104,7 +95,7 @@ def issue(directory: Path, role: str, name: str, vehicle: str | None = None) -> 
     now = datetime.now(UTC)
     if authority.not_valid_after_utc <= now:
         raise CertificateError(EXPIRED.format(directory / AUTHORITY))
-    key, until = generate_private_key(SECP256R1()), min(now + timedelta(days=DAYS), authority.not_valid_after_utc)
+    key, until = ec.generate_private_key(ec.SECP256R1()), min(now + timedelta(days=DAYS), authority.not_valid_after_utc)
     made = _signed(secret, authority.subject, subject, key.public_key(), until)
     return _write_pair(file, file.with_suffix(".key"), made, key)
 
@@ -112,43 +103,38 @@ def issue(directory: Path, role: str, name: str, vehicle: str | None = None) -> 
 def show(directory: Path) -> list[KeyFile]:
     """The authority and every certificate of a directory, each with what keeps it from being used.
 
-    Raises:
-        CertificateError: The directory has no authority.
+    Raises CertificateError if the directory has no authority.
     """
     ca = load(directory / AUTHORITY)
-    days_left = (ca.not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86400
-    authority = KeyFile(
-        file=AUTHORITY,
-        role="authority",
-        name=subject_field(ca, "CN"),
-        valid_until=ca.not_valid_after_utc,
-        days_left=days_left,
-        fingerprint=ca.fingerprint(SHA256()).hex(),
-        problem=EXPIRED.format(directory / AUTHORITY) if days_left < 0 else None,
-    )
+    expired = EXPIRED.format(directory / AUTHORITY) if ca.not_valid_after_utc < datetime.now(UTC) else None
     named = (file for file in sorted(directory.glob("*.pem")) if file.stem.partition(".")[0] in ROLES)
-    return [authority, *map(_shown, named)]
+    return [_row(ca, AUTHORITY, "authority", None, subject_field(ca, "CN"), expired), *map(_shown, named)]
 
 
 def _shown(file: Path) -> KeyFile:
     role, _, vehicle = file.stem.partition(".")
+    problem = None
     try:
         found = read_certificate(file)
     except CertificateError as error:
         return KeyFile(file=file.name, problem=str(error))
-    problem = None
     try:
         check(file, role, vehicle or None)
     except CertificateError as error:
         problem = str(error)
+    return _row(found.x509, file.name, found.role, found.vehicle, found.name, problem)
+
+
+def _row(made: x509.Certificate, file: str, role: str, vehicle: str | None, name: str, problem: str | None) -> KeyFile:
+    until = made.not_valid_after_utc
     return KeyFile(
-        file=file.name,
-        role=found.role,
-        vehicle=found.vehicle,
-        name=found.name,
-        valid_until=found.not_after,
-        days_left=found.days_left,
-        fingerprint=found.x509.fingerprint(SHA256()).hex(),
+        file=file,
+        role=role,
+        vehicle=vehicle,
+        name=name,
+        valid_until=until,
+        days_left=(until - datetime.now(UTC)).total_seconds() / 86400,
+        fingerprint=made.fingerprint(SHA256()).hex(),
         problem=problem,
     )
 
@@ -170,14 +156,9 @@ def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
 
 
 def _signed(
-    secret: EllipticCurvePrivateKey,
-    issuer: x509.Name,
-    subject: x509.Name,
-    public: EllipticCurvePublicKey,
-    until: datetime,
-    *,
-    authority: bool = False,
-) -> x509.Certificate:
+    secret: ec.EllipticCurvePrivateKey, issuer: x509.Name, subject: x509.Name, public: ec.EllipticCurvePublicKey,
+    until: datetime, *, authority: bool = False,
+) -> x509.Certificate:  # fmt: skip
     uses = dict.fromkeys(signature(x509.KeyUsage).parameters, False)
     uses["key_cert_sign" if authority else "digital_signature"] = True
     begin = datetime.now(UTC) - _EARLIER
@@ -192,28 +173,25 @@ def _signed(
     return builder.sign(secret, SHA256())
 
 
-def _read_key(file: Path) -> EllipticCurvePrivateKey:
+def _read_key(file: Path) -> ec.EllipticCurvePrivateKey:
     """Read the authority's private key. Raises CertificateError."""
     if not file.exists():
         raise CertificateError(f"{file} is not here: it stays where `aeroloop host keys init` made it; issue there")
     try:
-        return cast(EllipticCurvePrivateKey, load_pem_private_key(file.read_bytes(), None))
+        return cast(ec.EllipticCurvePrivateKey, load_pem_private_key(file.read_bytes(), None))
     except OSError as error:
         raise CertificateError(f"{file} cannot be read: {error.strerror}") from None
     except (ValueError, TypeError):  # TypeError: it is encrypted
         raise CertificateError(f"{file} is no private key in PEM without a password") from None
 
 
-def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: EllipticCurvePrivateKey) -> Path:
+def _write_pair(file: Path, secret: Path, made: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Path:
     """Write a certificate and its key as new files, of their mode from the first byte on."""
     for path in (file, secret):
         if os.path.lexists(path):
             raise CertificateError(f"{path} exists, and is not overwritten: move it away first")
-    contents = {
-        secret: (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600),
-        file: (made.public_bytes(Encoding.PEM), 0o644),
-    }
-    for path, (content, mode) in contents.items():
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    for path, content, mode in ((secret, pem, 0o600), (file, made.public_bytes(Encoding.PEM), 0o644)):
         try:
             with open(path, "xb", opener=partial(os.open, mode=mode)) as out:
                 out.write(content)

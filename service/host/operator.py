@@ -1,8 +1,7 @@
 """Operator commands: status of every role on the network, arm, stop, release, gains and reference.
 
-Each is a Zenoh query that the addressed role answers. Status is answered by the role's network thread from the last
-published one, so it never stalls a loop; the other commands are taken between two ticks. A process that hangs or that
-is no role delays none of them, and is named by its address and, on this host, by its role and process id.
+Each is a Zenoh query that the addressed role answers: status by its network thread, the others between two ticks. A
+process that hangs or is no role delays none of them, and is named by its address and, on this host, role and pid.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ import getpass
 import os
 import socket
 import time
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import zenoh
 from pydantic import ValidationError
@@ -28,49 +27,33 @@ from aeroloop.protocol.transport.network_settings import Endpoint, Identity, Net
 
 ANSWER_S: Final = 1.0
 
-Statuses = dict[str, dict[str, Status]]
-
 
 class OperatorError(AeroloopError):
     """No role answered, or the command was refused; one line."""
 
 
 class Gathered(NamedTuple):
-    """What is on the network.
+    """Statuses by vehicle and role, and a line about each process that accepts a connection and does not answer.
 
-    Attributes:
-        statuses: By vehicle and role. Of several controllers of one vehicle, the one with the session, if any.
-        silent: A line about each process that accepts a connection and does not answer.
+    Of several controllers of one vehicle, the status of the one with the session, if any.
     """
 
-    statuses: Statuses
+    statuses: dict[str, dict[str, Status]]
     silent: list[str]
 
 
 def gather(network: NetworkSettings) -> Gathered:
-    """Status of every role of every vehicle on the network.
-
-    Raises:
-        OperatorError: No role answers.
-    """
-    statuses: Statuses = {}
-
-    def received(reply: zenoh.Reply) -> None:
-        address = topics.read_key(str(reply.ok.key_expr)) if reply.ok is not None else None
-        if reply.ok is None or address is None or address.role is None:
-            return
-        with suppress(ValidationError):  # of another version
-            status = Status.model_validate_json(reply.ok.payload.to_bytes())
-            roles = statuses.setdefault(address.vehicle, {})
-            if address.role not in roles or status.session:
-                roles[address.role] = status
-
+    """Status of every role of every vehicle on the network. Raises OperatorError if no role answers."""
+    statuses: dict[str, dict[str, Status]] = {}
     with command_session(network) as here:
         here.wait_for_links()
-        for reply in _get(here.session, topics.key("status", "*"), b"", COMMAND_S):
-            received(reply)
+        for address, content in _replies(here.session, topics.key("status", "*"), b"", COMMAND_S):
+            with suppress(ValidationError):  # of another version
+                status, roles = Status.model_validate_json(content), statuses.setdefault(address.vehicle, {})
+                if address.role is not None and (address.role not in roles or status.session):
+                    roles[address.role] = status
         silent = _unanswered(here)
-    if not statuses:
+    if not any(statuses.values()):
         raise OperatorError("; ".join([_nobody(network), *silent]))
     return Gathered(statuses, silent)
 
@@ -78,8 +61,7 @@ def gather(network: NetworkSettings) -> Gathered:
 def only_vehicle(network: NetworkSettings) -> str | None:
     """The one vehicle on the network that has a controller or a plant; None if there is none.
 
-    Raises:
-        OperatorError: There are several.
+    Raises OperatorError if there are several.
     """
     try:
         found = gather(network).statuses
@@ -94,19 +76,21 @@ def only_vehicle(network: NetworkSettings) -> str | None:
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
     """Send a request to a vehicle's plant (`arm`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 
-    `arm` also recalls controllers that are holding or faulted.
-
-    Returns:
-        What was done, in one line.
+    `arm` also recalls controllers that are holding or faulted. Returns what was done, in one line.
 
     Raises:
         OperatorError: No role answers, or it refuses.
     """
     with command_session(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
+
+        def ask(topic: str, message: Message) -> list[Answer]:
+            replies = _replies(here.session, topics.key(topic, vehicle), message.encode(), ANSWER_S)
+            return [Answer.model_validate_json(content) for _, content in replies]
+
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
-            answers = _answers(here.session, topic, vehicle, message)
+            answers = ask(topic, message)
             time.sleep(POLL_S)
         if not answers:
             role = {"arm": "plant", "inject": "emulator"}.get(topic, "controller")
@@ -115,17 +99,12 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         if not done:
             raise OperatorError("; ".join(answer.text for answer in answers))
         if topic == "arm":
-            done += [answer.text for answer in _answers(here.session, "recall", vehicle, Request()) if answer.done]
+            done += [answer.text for answer in ask("recall", Request()) if answer.done]
         return "; ".join(done)
 
 
 class Stopped(NamedTuple):
-    """Outcome of a stop.
-
-    Attributes:
-        answers: What each plant answered.
-        failures: A line about each plant, or process that may be one, which did not.
-    """
+    """What each plant answered, and a line about each plant, or process that may be one, which did not."""
 
     answers: list[str]
     failures: list[str]
@@ -144,35 +123,33 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     answers: dict[str, list[str]] = {}
 
     def received(reply: zenoh.Reply) -> None:
-        address = topics.read_key(str(reply.ok.key_expr)) if reply.ok is not None else None
-        if reply.ok is not None and address is not None:
-            answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
+        for address, content in _good([reply]):
+            answers[address.vehicle].append(Answer.model_validate_json(content).text)
 
-    with command_session(
-        network, wait_s, Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
-    ) as here:
+    identity = Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
+    with command_session(network, wait_s, identity) as here:
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < wait_s:
             # A plant declares its token last, so one with a token answers.
-            for token in _get(here.session, topics.key("alive", vehicle, role="plant"), None, COMMAND_S):
-                address = topics.read_key(str(token.ok.key_expr)) if token.ok is not None else None
-                if address is not None and address.vehicle not in answers:
+            for address in _alive(here.session, vehicle, role="plant"):
+                if address.vehicle not in answers:
                     answers[address.vehicle] = []
+                    payload = Request(by=_user()).encode()
                     here.session.get(
-                        topics.key("stop", address.vehicle),
-                        received,
-                        payload=Request(by=_user()).encode(),
-                        timeout=wait_s,
-                        target=zenoh.QueryTarget.ALL,
-                        consolidation=zenoh.ConsolidationMode.NONE,
+                        topics.key("stop", address.vehicle), received, payload=payload, timeout=wait_s, **_ALL
                     )
             if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
                 break
             time.sleep(POLL_S)
         unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > COMMAND_S)
-        alone = _without_plant(here.session, answers) if network.mode == "client" and vehicle == "*" else []
+        alone = set[str]()
+        if network.mode == "client" and vehicle == "*":  # a router has forgotten a plant that hangs
+            controlled = {
+                each.vehicle for each in _alive(here.session, "*") if (each.role or "").startswith("controller")
+            }
+            alone = controlled - {*answers}
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
-    failures += [f"{name} has a controller, and no plant of it answers" for name in alone]
+    failures += [f"{name} has a controller, and no plant of it answers" for name in sorted(alone)]
     failures += unanswered
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
@@ -188,30 +165,27 @@ def _user() -> str:
     return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:64]
 
 
-def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str]:
-    """Vehicles that have a controller and did not answer: a router has forgotten a plant that hangs."""
-    tokens = _get(session, topics.key("alive", "*"), None, COMMAND_S)
-    found = [topics.read_key(str(token.ok.key_expr)) for token in tokens if token.ok is not None]
-    controlled = {each.vehicle for each in found if each and each.role and each.role.startswith("controller")}
-    return sorted(name for name in controlled if name not in answered)
+_ALL: Final[Any] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+"""Of a query: replies of several roles to one key are not merged."""
 
 
-def _get(session: zenoh.Session, key: str, payload: bytes | None, timeout_s: float) -> Iterable[zenoh.Reply]:
-    """All replies to a query; those of several roles to one key are not merged. A token's key if `payload` is None."""
-    if payload is None:
-        return session.liveliness().get(key, timeout=timeout_s)
-    return session.get(
-        key,
-        payload=payload,
-        timeout=timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-    )
+def _replies(
+    session: zenoh.Session, key: str, payload: bytes, timeout_s: float
+) -> Iterator[tuple[topics.Address, bytes]]:
+    return _good(session.get(key, payload=payload, timeout=timeout_s, **_ALL))
 
 
-def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
-    replies = _get(session, topics.key(topic, vehicle), message.encode(), ANSWER_S)
-    return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+def _alive(session: zenoh.Session, vehicle: str, **role: str) -> Iterator[topics.Address]:
+    """topics.Addresses of the roles that have declared their liveliness token."""
+    for address, _ in _good(session.liveliness().get(topics.key("alive", vehicle, **role), timeout=COMMAND_S)):
+        yield address
+
+
+def _good(replies: Iterable[zenoh.Reply]) -> Iterator[tuple[topics.Address, bytes]]:
+    """topics.Address and content of each reply that is no error."""
+    for reply in replies:
+        if reply.ok is not None and (address := topics.read_key(str(reply.ok.key_expr))) is not None:
+            yield address, reply.ok.payload.to_bytes()
 
 
 def _unanswered(here: CommandSession, but: Sequence[str] = (), *, why: bool = True) -> list[str]:

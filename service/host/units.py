@@ -1,7 +1,6 @@
 """systemd units for the daemons, written from one template for the configured plant.
 
-`Type=notify`: a daemon notifies systemd when it is ready, once a second while it runs, and when it stops. The sandbox
-allows what the configuration needs: the network, the plant's bus or device, the folders of interpreter and
+The sandbox allows what the configuration needs: the network, the plant's bus or device, the folders of interpreter and
 configuration, and the recorder's logs.
 """
 
@@ -32,8 +31,7 @@ _WITHOUT_DEVICE: Final = ("socketcan", "socketcand", "udp_multicast", "virtual")
 """python-can's interfaces that open no device file."""
 
 _TEMPLATE: Final = """\
-# For plant.via = "{via}", by `aeroloop host units`; make it again when that changes. Your own changes go to
-# `systemctl edit`, which keeps them in another file.
+# For plant.via = "{via}", by `aeroloop host units`; your own changes go to `systemctl edit`.
 [Unit]
 Description=aeroloop: {what}
 After=network-online.target
@@ -67,13 +65,7 @@ class UnitError(AeroloopError):
 
 
 class Source(NamedTuple):
-    """How the daemons are started.
-
-    Attributes:
-        config: Their configuration file.
-        overrides: `--set` words beside it.
-        settings: The configuration that both make.
-    """
+    """How the daemons are started: their configuration file, `--set` words beside it, and what both make."""
 
     config: Path
     overrides: Sequence[str]
@@ -81,7 +73,7 @@ class Source(NamedTuple):
 
     @property
     def options(self) -> list[str]:
-        """The options that name both on a command line."""
+        """The options that name file and words on a command line."""
         return ["--config", str(self.config.absolute()), *(word for each in self.overrides for word in ("--set", each))]
 
 
@@ -92,33 +84,28 @@ def units_of(settings: Settings) -> list[str]:
 
 def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
-    # systemd starts a plant again by itself, so it is unarmed then; a --set of the user's own comes later and wins.
-    unarmed = ["--set", "plant.armed_at_start=false"] if name == "plant" else []
-    words = [*_executable(), name, *unarmed, *source.options]
-    rights = _user(source)
+    first, last, rights = list[str](), list[str](), _user(source)
+    families, devices = list[str](), ["PrivateDevices=yes"]
     if name == "plant":
+        # systemd starts a plant again by itself, so it is unarmed then; a --set of the user's own comes later and wins.
+        first = ["--set", "plant.armed_at_start=false"]
         configured = source.settings.plant.state_directory
         rights.append(f"ReadWritePaths={_quoted(str(configured))}" if configured else "StateDirectory=aeroloop")
+        families, devices = _access(source.settings)
     if name == "recorder":
-        words += ["--set", "recorder.path=%L/aeroloop"]
-        rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
-    elif name == "router":
-        rights.append("CapabilityBoundingSet=")
+        last = ["--set", "recorder.path=%L/aeroloop"]
+        rights.append("LogsDirectory=aeroloop")
+    if name in ("plant", "controller"):
+        capabilities = "CAP_SYS_NICE CAP_IPC_LOCK"
+        rights += [f"LimitRTPRIO={PRIORITY}", "LimitMEMLOCK=infinity"]
     else:
-        rights += [
-            f"LimitRTPRIO={PRIORITY}",
-            "LimitMEMLOCK=infinity",
-            "CapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK",
-        ]
-    families, devices = _access(source.settings) if name == "plant" else ([], [])
-    rights += devices or ["PrivateDevices=yes"]
+        capabilities = ""
     # Netlink lists this host's addresses, for peers on other hosts.
-    rights.append(" ".join(["RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK", *families]))
+    families = ["AF_INET AF_INET6 AF_UNIX AF_NETLINK", *families]
+    rights += [f"CapabilityBoundingSet={capabilities}", *devices, f"RestrictAddressFamilies={' '.join(families)}"]
+    words = [*_executable(), name, *first, *source.options, *last]
     return _TEMPLATE.format(
-        via=source.settings.plant.via,
-        what=UNITS[name],
-        command=" ".join(_quoted(word) for word in words),
-        rights="\n".join(rights),
+        via=source.settings.plant.via, what=UNITS[name], command=" ".join(map(_quoted, words)), rights="\n".join(rights)
     )
 
 
@@ -135,20 +122,10 @@ def install(folder: Path, source: Source) -> list[Path]:
 
 def next_steps(folder: Path | None, source: Source) -> list[str]:
     """Commands that remain after `install` into a folder (None: the units were printed) until the daemons run."""
-    hidden = [path for path in (Path(_executable()[0]), source.config.absolute()) if path.is_relative_to("/tmp")]  # noqa: S108
-    steps = [
-        f"# {path} is in /tmp, which units do not see (PrivateTmp=): move it, to /opt for example" for path in hidden
-    ]
-    if not source.config.exists():
-        steps.append(f"sudo mkdir -p {source.config.parent}")
-        steps.append(f"aeroloop show config | sudo tee {source.config} >/dev/null")
-    if folder is None:
-        command = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
-        steps.append(f"sudo {shlex.join(command)}")
-    elif folder.absolute() != SYSTEM_FOLDER:
-        steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
+    install = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
     names = " ".join(f"aeroloop-{name}" for name in units_of(source.settings))
-    return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
+    steps = ["sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
+    return steps if folder is not None else [f"sudo {shlex.join(install)}", *steps]
 
 
 def _executable() -> list[str]:
@@ -177,24 +154,20 @@ def _user(source: Source) -> list[str]:
         return [f"# The keys in {keys} are its owner's alone.", f"User={keys.owner()}", protected]
     if not homes:
         return ["DynamicUser=yes", protected]
-    return [
-        f"# {homes[0]} is in a home, so its owner runs the daemon; installed under /opt, it gets a user of its own.",
-        f"User={homes[0].owner()}",
-        protected,
-    ]
+    why = f"# {homes[0]} is in a home, so its owner runs the daemon; installed under /opt, it gets a user of its own."
+    return [why, f"User={homes[0].owner()}", protected]
 
 
 def _access(settings: Settings) -> tuple[list[str], list[str]]:
     """Address families and lines on devices that the plant end needs besides the network's."""
     via, can = settings.plant.via, settings.can
-    on_bus = via == "can" and can.interface not in _WITHOUT_DEVICE
     if via == "can" and can.interface == "socketcan":
-        return ["AF_CAN"], []
-    if on_bus and can.channel.startswith("/dev/"):
+        return ["AF_CAN"], ["PrivateDevices=yes"]
+    if via == "emulator" or (via == "can" and can.interface in _WITHOUT_DEVICE):
+        return [], ["PrivateDevices=yes"]
+    if via == "can" and can.channel.startswith("/dev/"):
         device = Path(can.channel.partition("@")[0])
         group = device.group() if device.exists() else "dialout"
         return [], ["DevicePolicy=closed", f"DeviceAllow={device} rw", f"SupplementaryGroups={group}"]
-    if on_bus or via == "quanser":
-        comment = "# USB; its user also needs write access to /dev/bus/usb, as a udev rule gives it."
-        return [], [comment, "DevicePolicy=closed", "DeviceAllow=char-usb_device rw"]
-    return [], []
+    comment = "# USB; its user also needs write access to /dev/bus/usb, as a udev rule gives it."
+    return [], [comment, "DevicePolicy=closed", "DeviceAllow=char-usb_device rw"]

@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future
@@ -20,7 +21,7 @@ from contextlib import contextmanager
 from functools import cache, lru_cache
 from hashlib import sha256
 from importlib.metadata import version
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -168,14 +169,13 @@ def local_processes() -> Iterator[Workers]:
     context.set_forkserver_preload([__name__])
     resource_tracker.ensure_running()  # it ends with SIGINT unblocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the server and its workers inherit it
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    first = context.Process(target=int)  # waits for the server's imports: ^C must not meet a worker that starts
-    first.start()
-    first.join()
     with futures.ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as executor:
+        try:
+            futures.wait(
+                [executor.submit(time.sleep, 0.05) for _ in range(count)]
+            )  # ^C must not meet a worker that starts
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             yield Workers(executor, count)
         except BaseException:  # a failure or ^C: what the others compute has no use

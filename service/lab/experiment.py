@@ -18,7 +18,7 @@ from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Claim, Refusal
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
-from aeroloop.service.config import Settings
+from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
@@ -91,16 +91,20 @@ def experiment(
 
 
 def run_experiment(
-    settings: Settings,
-    duration_s: float,
+    settings: Settings | None = None,
+    duration_s: float = 50.0,
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,
     *,
     plant: Plant | None = None,
     controller: Controller | None = None,
 ) -> Figures:
-    """Figures of an experiment; arguments and errors are those of `experiment`."""
-    return experiment(settings, duration_s, progress, watch, plant=plant, controller=controller).figures
+    """Run controller and plant in lockstep in this process; it repeats bit for bit. Returns the figures of merit.
+
+    `settings` are the defaults (the paper's experiment at 8 and 6 bits) if None; other arguments as of `experiment`.
+    Raises ValueError if the plant trips, or the configuration makes no loop.
+    """
+    return experiment(settings or load(), duration_s, progress, watch, plant=plant, controller=controller).figures
 
 
 def _as_one_function(settings: Settings, duration_s: float, progress: Callable[[float], None] | None) -> Course | None:

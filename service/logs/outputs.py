@@ -20,13 +20,13 @@ class OutputError(AeroloopError):
     """An output cannot be written, or must not be; one line with the reason and what to do."""
 
 
-def check_output(out: Path, inputs: Sequence[Path | None] = (), *, force: bool = False) -> None:
-    """Raise OutputError if a file is a log, an input, no regular file, or exists and must not be replaced.
+def check_output(out: Path | None, inputs: Sequence[Path | None] = (), *, force: bool = False) -> None:
+    """Raise OutputError if a file, if any, is a log, an input, no regular file, or exists and must not be replaced.
 
     `inputs` are files and folders that the command reads; None stands for an option that was not given.
     """
     try:
-        if not out.exists():
+        if out is None or not out.exists():
             return
         if any(path is not None and path.exists() and path.samefile(out) for path in inputs):
             raise OutputError(f"{out} is an input of this command; name another file")

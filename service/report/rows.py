@@ -98,7 +98,7 @@ def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
     """What is proven of a run and what of it held, with whether that is good; nothing if it was not checked."""
     if (found := run.theorem) is None:
         return []
-    sentences: list[tuple[bool | None, str]] = [(bool(found.holds), found.verdict)]
+    sentences: list[tuple[bool | None, str]] = [(found.holds, found.verdict)]  # None: no theorem
     judged = [("Lemma 1", found.broken, 0), ("the bound at every instant", found.pointwise_share, 1)]
     kept = " and ".join(what for what, worst, _ in judged if worst is not None)
     broke = " and ".join(what for what, worst, most in judged if worst is not None and worst > most)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
-from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.errors import ConfigError
 from aeroloop.service.figures import Figures
 from aeroloop.service.review.report import Check, Findings
 
@@ -95,7 +95,7 @@ AT_LEAST: Final = ("theorem.held",)  # figures of which more is better
 UNSEEN_SHOWN: Final = 3  # of what a figure does not see, so many are listed in its line
 
 
-class LimitError(AeroloopError):
+class LimitError(ConfigError):
     """Not a limit; one line with the correct form."""
 
 

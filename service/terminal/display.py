@@ -1,17 +1,14 @@
-"""One progress bar on stderr: drawn on a terminal, and erased at its end; elsewhere a share is a line now and then."""
+"""One progress bar on stderr: drawn on a terminal, and erased at its end."""
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import degrees, inf
-from typing import TYPE_CHECKING, Final
+from math import degrees
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from aeroloop.protocol.wire.attitude import angle
 
@@ -19,55 +16,29 @@ if TYPE_CHECKING:
     from aeroloop.service.config import Settings
     from aeroloop.service.testing.process_group import ProcessGroup
 
-LINE_S: Final = 10.0
-
-
-class _Done(ProgressColumn):
-    """Seconds or runs done, of how many; of a share 0…1 the percentage."""
-
-    def render(self, task: Task) -> Text:
-        if task.total is None:
-            return Text(f"{task.completed:g}")
-        return Text(f"{task.percentage:.0f} %" if task.total == 1 else f"{task.completed:.0f}/{task.total:.0f}")
-
 
 @contextmanager
 def progress_bar(title: str, total: float | None = None, *, hidden: bool = False) -> Iterator[Callable[..., None]]:
-    """A bar, updated by the yielded `update(done, total, title)`; what is None stays.
-
-    Where stderr is no terminal, a share (`total` is 1) is a line every `LINE_S` instead.
-    """
+    """A bar, updated by the yielded `update(done, total, title)`; what is None stays."""
     console = Console(stderr=True)
-    line_due = inf if hidden or total != 1 or console.is_terminal else time.monotonic() + LINE_S
-    columns = TextColumn("{task.description}", markup=False), BarColumn(20), _Done(), TimeRemainingColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(20), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as progress:
         task = progress.add_task(title, total=total)
 
         def update(done: float | None = None, total: float | None = None, title: str | None = None) -> None:
-            nonlocal line_due
             progress.update(task, completed=done, total=total, description=title)
-            if time.monotonic() >= line_due:
-                line_due = time.monotonic() + LINE_S
-                now = progress.tasks[0]
-                sys.stderr.write(f"aeroloop: {now.description}, {now.percentage:.0f} %\n")
 
         yield update
 
 
 def demo_progress(settings: Settings, update: Callable[..., None]) -> Callable[[str, ProcessGroup], None]:
-    """Update a bar with what the demo waits for, and from the first command on with the loop's values of now."""
+    """Update a bar with what the demo waits for, and from the first command on with time and error."""
 
     def show(waiting_for: str, now: ProcessGroup) -> None:
         if waiting_for or now.telemetry is None:
-            states = f" ({now.states})" if now.states and now.telemetry is None else ""
-            update(title=f"waiting for {waiting_for}{states}")
-            return
-        values = [
-            f"error {degrees(angle(*now.telemetry.attitude_error)):5.2f}°",
-            f"{' '.join(f'{u:+5.1f}' for u in now.telemetry.voltages)} V",
-        ]
-        if "controller" in now.statuses:
-            values.append(f"{sum(status.skipped for status in now.statuses.values())} skipped")
-        update(now.telemetry.tick * settings.loop.period, title=", ".join(values))
+            update(title=f"waiting for {waiting_for}")
+        else:
+            error = degrees(angle(*now.telemetry.attitude_error))
+            update(now.telemetry.tick * settings.loop.period, title=f"error {error:5.2f}°")
 
     return show

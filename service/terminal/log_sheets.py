@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -16,31 +15,24 @@ from aeroloop.service.terminal.show import Row, Sheets
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
     from aeroloop.service.lab.demo import DemoFigures
+    from aeroloop.service.logs.copies import Recovery
+    from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.replay import EndReplay, Replay
 
-MARKS_SHOWN: Final = 12
-"""Events that do not matter."""
 BEFORE: Final = "before"
 """In place of its time, of what happened before the session."""
 BEFORE_SHOWN: Final = 4
-DISAGREEMENTS_SHOWN: Final = 5
-SESSIONS_SHOWN: Final = 9
-DAMAGES_SHOWN: Final = 20
-UNSEEN_SHOWN: Final = 3
-
-LAPSES: Final = {
-    "late": "late measurements", "malformed": "malformed measurements", "stale": "stale commands",
-    "repeated": "repeated commands", "refused": "refused commands",
-    "withheld": "commands dropped or delayed by a fault", "missed": "measurements that the controller missed",
-}  # fmt: skip
-"""What `Findings.lapses` counts."""
+"""Events of no matter from before the session."""
+SHOWN: Final = 12
+"""Lines of one kind; `--json` has them all."""
 
 
 def figure_sheets(figures: Figures) -> Sheets:
     """Main figures of merit of one run, each that is missing with its reason; its trips, damages and log."""
     yield "", _one_run(figures)
     lines = [f"tripped: {trip}" for trip in figures.trips] + [f"not read: {line}" for line in figures.damages]
-    if lines := [*lines, *([f"log: {figures.log}"] if figures.log else [])]:
+    lines += [f"log: {figures.log}"] if figures.log else []
+    if lines:
         yield "\n".join(lines), []
 
 
@@ -63,19 +55,19 @@ def review_sheets(findings: Findings) -> Sheets:
     if findings.faults:
         yield "with faults", [_fault(fault) for fault in findings.faults]
     yield "", _one_run(findings)
-    durations: list[Row] = []
-    for each in rows.durations([findings]):
-        percentiles = dict(zip(rows.PERCENTILES.values(), each.percentiles, strict=True))
-        durations.append({"": each.label, **percentiles})
-    if durations:
-        yield "", durations
+    if durations := rows.durations([findings]):
+        names = rows.PERCENTILES.values()
+        yield "", [{"": each.label, **dict(zip(names, each.percentiles, strict=True))} for each in durations]
     yield "", [{"of the log": label, "found": text} for label, text in _details(findings)]
     if findings.theorem is not None:
-        signs = {True: "✓", False: "✗", None: ""}
+        signs = {True: "✓", False: "✗", None: "–"}
         yield "", [{"": signs[good], "theorem": text} for good, text in rows.theorem_sentences(findings)]
-    others = [entry for entry in since if not grave(entry[1])]
-    if before or others:
-        yield "", _other_events(before, others)
+    others = [*before[-BEFORE_SHOWN:], *(entry for entry in since if not grave(entry[1]))]
+    if others:
+        more = max(0, len(before) - BEFORE_SHOWN) + max(0, len(others) - SHOWN)
+        yield "", [_event(*each) for each in others[:SHOWN]]
+        if more:
+            yield f"… and {more} more such events; --json has them all", []
     if findings.checks:
         checks = findings.checks
         yield "", [{"": "✓" if each.holds else "✗", "required": each.text, "found": each.found} for each in checks]
@@ -93,51 +85,39 @@ def comparison_sheets(reports: Sequence[Report]) -> Sheets:
         {"": key, **dict(zip(names, map(rows.shown, values), strict=True))} for key, values in differences(reports)
     ]
     yield (f"{'differs in' if differing else 'no difference between'} the configurations", differing)
-    lines = [
-        f"{report.name}: {line}"
-        for report in reports
-        for line in (
-            *(f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"),
-            *_some(missing(report.findings)),
-        )
-    ]
+    lines: list[str] = []
+    for report in reports:
+        trips = [f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"]
+        lines += [f"{report.name}: {line}" for line in (*trips, *_some(missing(report.findings)))]
     if lines:
         yield "\n".join(lines), []
 
 
 def _one_run(run: Figures) -> list[Row]:
-    found = [
-        (figure, value)
-        for figure, (value,), _ in rows.figure_rows([run])
-        if figure.main or (value.number is not None and figure.key in ("duration_s", "latency_us"))
-    ]
-    unknown = any(value.why for _, value in found)
-    reasons = [{"why not": value.why or ""} if unknown else {} for _, value in found]
-    return [
-        {"figure": figure.name, "value": value.text, "unit": figure.unit} | reason
-        for (figure, value), reason in zip(found, reasons, strict=True)
-    ]
+    found: list[Row] = []
+    for figure, (value,), _ in rows.figure_rows([run]):
+        if figure.main or (value.number is not None and figure.key in ("duration_s", "latency_us")):
+            row = {"figure": figure.name, "value": value.text, "unit": figure.unit}
+            found.append(row | {"why not": value.why or ""})
+    known = not any(row["why not"] for row in found)
+    return [{name: row[name] for name in row if not (known and name == "why not")} for row in found]
 
 
 def _details(findings: Findings) -> Iterator[tuple[str, str]]:
     for line in _some(missing(findings)):
         yield "missing", line
+    gaps = "none"
     if findings.gap_count:
         longest = max(findings.gaps, key=lambda gap: gap.ticks)
-        yield "gaps", f"{findings.gap_count}, the longest {count(longest.ticks, 'tick')} at {longest.time_s:.3f} s"
-    else:
-        yield "gaps", "none"
+        gaps = f"{findings.gap_count}, the longest {count(longest.ticks, 'tick')} at {longest.time_s:.3f} s"
+    yield "gaps", gaps
     shares = (f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items())
     yield "at the outermost level", ", ".join(shares)
-    for name, n in findings.invalid.items():
-        if n:
-            yield f"invalid {name}s", str(n)
+    yield from ((f"invalid {name}s", str(n)) for name, n in findings.invalid.items() if n)
     if findings.lapses:
-        yield "frames and ticks", ", ".join(f"{LAPSES[name]}: {n:,}" for name, n in findings.lapses.items())
-    for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
-        yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
-    if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
-        yield "", f"… and {more} more keys; --json has them all"
+        yield "frames and ticks", ", ".join(f"{name}: {n:,}" for name, n in findings.lapses.items())
+    differing = [f"{each.key}: controller {each.controller}, plant {each.plant}" for each in findings.disagreements]
+    yield from (("ends disagree", line) for line in _some(differing))
     if findings.log:
         yield "path", findings.log
     if (part := findings.reasons.get("duration_s")) is not None:
@@ -150,7 +130,7 @@ def _details(findings: Findings) -> Iterator[tuple[str, str]]:
     its = [one for one in findings.recorded if one.vehicle == findings.vehicle]
     if len(its) > 1:
         listed = [f"{i} is {one.session}, {one.duration_s:.1f} s" for i, one in enumerate(its, 1)]
-        yield "sessions", f"{'; '.join(_some(listed, SESSIONS_SHOWN))}; --session N shows another"
+        yield "sessions", f"{'; '.join(_some(listed))}; --session N shows another"
 
 
 def _fault(fault: FaultInterval) -> Row:
@@ -162,17 +142,18 @@ def _fault(fault: FaultInterval) -> Row:
 
 def timed(marks: Sequence[Mark]) -> list[tuple[str, Mark]]:
     """Events in order, each with its time on the law's clock, or `before` or `after` the session."""
-    within = [i for i, mark in enumerate(marks) if mark.time_s is not None] or [len(marks)]
+    found, outside = list[tuple[str, Mark]](), BEFORE
+    for mark in marks:
+        if mark.time_s is None:
+            found.append((outside, mark))
+        else:
+            found.append((f"{round(mark.time_s, 3) + 0.0:.3f} s", mark))
+            outside = "after"
+    return found
 
-    def when(i: int, time_s: float | None) -> str:
-        outside = BEFORE if i < within[0] else "after"
-        return outside if time_s is None else f"{round(time_s, 3) + 0.0:.3f} s"
 
-    return [(when(i, mark.time_s), mark) for i, mark in enumerate(marks)]
-
-
-def _event(when: str, role: str, kind: str, text: str) -> Row:
-    return {"time": when, "role": role, "event": kind, "what": text}
+def _event(when: str, mark: Mark, again: str = "") -> Row:
+    return {"time": when, "role": mark.role, "event": mark.kind, "what": mark.text + again}
 
 
 def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
@@ -185,56 +166,54 @@ def _grave_events(marks: Sequence[tuple[str, Mark]]) -> list[Row]:
     for (when, first), *more in alike.values():
         last = more[-1][0].replace("after", "after the session") if more else ""
         again = f" ({count(1 + len(more), 'such event')} in all, the last: {last})" if more else ""
-        found.append(_event(when, first.role, first.kind, first.text + again))
+        found.append(_event(when, first, again))
     return found
 
 
-def _other_events(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, Mark]]) -> list[Row]:
-    """Events that do not matter, after the last few from before the session; earlier ones are counted in one row."""
-    found = []
-    if earlier := Counter(mark.kind for _, mark in before[:-BEFORE_SHOWN]):
-        counts = ", ".join(f"{n} {kind}" for kind, n in earlier.items())
-        found.append(_event(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all"))
-    shown = [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]
-    found += [_event(when, mark.role, mark.kind, mark.text) for when, mark in shown]
-    if (more := len(marks) - MARKS_SHOWN) > 0:
-        found.append(_event("", "", "", f"… and {more} more such events; --json has them all"))
-    return found
+def _some(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - SHOWN
+    return [*lines[:SHOWN], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
-def _some(lines: Sequence[str], shown: int = DAMAGES_SHOWN) -> list[str]:
-    more = len(lines) - shown
-    return [*lines[:shown], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
+def recovery_sheets(recovery: Recovery) -> Sheets:
+    """What was recovered, and a line for each part that was not."""
+    found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"
+    yield "\n".join([found, *(f"not recovered, {line}" for line in recovery.lost)]), []
+
+
+def export_sheets(exported: Exported) -> Sheets:
+    """What was exported, and what of the log was not."""
+    if exported.sessions is None:
+        found = f"{exported.rows} messages on {len(exported.columns)} channels"
+    else:
+        found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
+    lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
+    if others := exported.left_out:
+        names = ", ".join(_some(others))
+        lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
+    yield "\n".join([f"{exported.out}: {found}", *lines]), []
 
 
 def replay_sheets(replay: Replay) -> Sheets:
     """A row for each session, where each end first differs, and the verdict on each end."""
-    sessions: list[Row] = [
-        {
-            "session": f"{one.vehicle}/{one.session}",
-            "from tick": "–" if one.first_tick is None else str(one.first_tick),
-            "ticks": str(one.ticks),
-            "differ": str(one.differ),
-            "rms V": "–" if one.rms_v is None else f"{one.rms_v:.3f}",
-            "largest V": "–" if one.max_v is None else f"{one.max_v:.2f}",
-            "u_total V²·s": f"{one.u_total_logged:.1f} → {one.u_total_computed:.1f}",
-        }
-        for one in replay.sessions
-    ]
+    sessions: list[Row] = []
+    for one in replay.sessions:
+        row = {"session": f"{one.vehicle}/{one.session}"}
+        row |= {"from tick": "–" if one.first_tick is None else str(one.first_tick), "ticks": str(one.ticks)}
+        row |= {"differ": str(one.differ), "rms V": "–" if one.rms_v is None else f"{one.rms_v:.3f}"}
+        row |= {"largest V": "–" if one.max_v is None else f"{one.max_v:.2f}"}
+        sessions.append(row | {"u_total V²·s": f"{one.u_total_logged:.1f} → {one.u_total_computed:.1f}"})
     if sessions:
         yield "", sessions
-    lines = [
-        f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): {first.logged} logged, "
-        f"{first.computed} computed"
-        for session in replay.sessions
-        if (first := session.first_difference) is not None
-    ]
-    lines += [
-        f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} logged, "
-        f"{other.computed} computed"
-        for plant in replay.plants
-        if (other := plant.first_difference) is not None
-    ]
+    lines = []
+    for session in replay.sessions:
+        if (first := session.first_difference) is not None:
+            where = f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s)"
+            lines.append(f"{where}: {first.logged} logged, {first.computed} computed")
+    for plant in replay.plants:
+        if (other := plant.first_difference) is not None:
+            where = f"plant: first differs at tick {other.session_tick} of {other.session}"
+            lines.append(f"{where}: {other.field} {other.logged} logged, {other.computed} computed")
     lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
@@ -246,18 +225,15 @@ def _replayed(replay: Replay, name: End) -> str:
     end: EndReplay | None = getattr(replay, name)
     unseen, reason = replay.unseen.get(name, []), replay.reasons.get(name, "")
     if end is None:
-        unseen, found = [line for line in unseen if reason not in line], f"not replayed: {reason}"
-    elif end.differ:
-        found = f"{end.ticks} ticks, {end.differ} differ"
-    elif unseen:
-        found = f"the same, byte for byte, at {end.ticks} ticks"
-    else:
-        found = f"{end.ticks} ticks, every tick is the same, byte for byte"
+        others = [line for line in unseen if reason not in line]
+        return f"not replayed: {reason}" + (f"; not compared: {'; '.join(_some(others))}" if others else "")
+    found = f"{end.ticks} ticks, {end.differ} differ"
+    if not end.differ:
+        same = "the same, byte for byte"
+        found = f"{same}, at {end.ticks} ticks" if unseen else f"{end.ticks} ticks, every tick is {same}"
     if unseen:
-        found += f"; not compared: {'; '.join(_some(unseen, UNSEEN_SHOWN))}"
-    if end is None:
-        return found
-    if reason and not unseen:
+        found += f"; not compared: {'; '.join(_some(unseen))}"
+    elif reason:
         found += f"; {reason}"
     open_ended = [gap for gap in replay.missing if gap.end == name and not gap.rows]
-    return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:UNSEEN_SHOWN])
+    return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:SHOWN])

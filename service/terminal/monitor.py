@@ -1,7 +1,6 @@
 """Live view of the network, `op top`: every role of every vehicle, from its published messages.
 
-Subscribes to status, telemetry, truth and events. What is shown is true now: values of a session that has ended are
-left out, and what was not received for `SILENT_S` is marked with its age.
+What is shown is true now: values of a session that has ended are left out, and what is silent is marked with its age.
 """
 
 from __future__ import annotations
@@ -32,20 +31,16 @@ from aeroloop.service.terminal.show import drawn
 REFRESH_S: Final = 0.2
 EVENTS: Final = 5
 
-
-Latest = dict[str, dict[tuple[str, str], tuple[float, Any]]]
-"""By vehicle, and by topic and role, the last message with the time of its arrival on the clock [s]."""
-
 MODELS: Final[dict[str, type[Message]]] = {"status": Status, "telemetry": Telemetry, "truth": Truth, "event": Event}
 
 
 class Top:
-    """Collects messages and draws them."""
+    """Collects messages and draws them: of each vehicle the last one by topic and role, with its time [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._latest: Latest = {}
+        self._latest: dict[str, dict[tuple[str, str], tuple[float, Any]]] = {}
         self._events: deque[str] = deque(maxlen=EVENTS)
 
     def receive(self, key: str, payload: bytes) -> None:
@@ -66,26 +61,28 @@ class Top:
             now, blocks = self._clock(), list[Group]()
             for name, latest in sorted(self._latest.items()):
                 ages = {each: (now - at, message) for each, (at, message) in latest.items()}
-                statuses = {role: each for (topic, role), each in ages.items() if topic == "status"}
+                statuses = {
+                    role: message.model_copy(update={"age_s": age})
+                    for (topic, role), (age, message) in ages.items()
+                    if topic == "status"
+                }
                 values = "   ".join(_values(ages, statuses))
-                blocks += [drawn(rows, title, width) for title, rows in (*role_sheets(statuses, name), (values, []))]
-                blocks.append(drawn([], " ", width))
+                sheets = (*role_sheets(statuses, name), (values, []), (" ", []))
+                blocks += [drawn(rows, title, width) for title, rows in sheets]
             events = "\n".join(self._events) if blocks else "no role on the network yet"
             return Group(*blocks, drawn([], events, width))
 
 
-def _values(
-    ages: Mapping[tuple[str, str], tuple[float, Any]], statuses: Mapping[str, tuple[float, Any]]
-) -> Iterator[str]:
+def _values(ages: Mapping[tuple[str, str], tuple[float, Any]], statuses: Mapping[str, Status]) -> Iterator[str]:
     """Attitude, error and voltages, as far as they are those of now."""
     if ("truth", "") in ages:
         age, truth = ages["truth", ""]
-        roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
+        roll, pitch, yaw = map(degrees, to_euler(truth.attitude))
         text = f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°"
         yield text if age < SILENT_S else f"no attitude for {duration(age)}"
     # The session that runs, by the plant, or by the controller where there is no plant.
-    age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
-    session = status.session if status is not None and age < SILENT_S else None
+    status = statuses.get("plant") or statuses.get("controller")
+    session = status.session if status is not None and status.age_s < SILENT_S else None
     age, telemetry = ages.get(("telemetry", ""), (0.0, None))
     if session is None:
         if statuses:
@@ -100,26 +97,15 @@ def _values(
 
 
 def watch(network: NetworkSettings) -> None:
-    """Subscribe, and draw five times a second until ^C.
-
-    Raises:
-        NetworkError: The network cannot be joined.
-    """
+    """Subscribe, and draw five times a second until ^C. Raises NetworkError if the network cannot be joined."""
     top, console = Top(), Console()
 
     def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
-    def answered(reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            receive(reply.ok)
-
-    with (
-        join(network, listen=False) as session,
-        Live(console=console, auto_refresh=False, screen=console.is_terminal) as live,
-    ):
-        session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
-        for name in MODELS:
+    live = Live(console=console, auto_refresh=False, screen=console.is_terminal)
+    with join(network, listen=False) as session, live:
+        for name in MODELS:  # a status comes within a second
             session.declare_subscriber(topics.key(name, "*"), receive)
         with suppress(KeyboardInterrupt):
             while True:

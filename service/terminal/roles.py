@@ -5,59 +5,60 @@ What is silent is marked with the age of its last status.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.protocol.transport.certificate import SOON_DAYS
-from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
+from aeroloop.service.host.health import NEEDED, SILENT_S, Trouble
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.show import Row, Sheets
 
 
-def role_sheets(statuses: Mapping[str, tuple[float, Status]], vehicle: str = "") -> Sheets:
-    """The roles of one vehicle: by role the age of its status [s], and the status."""
-    everyone = sorted({*statuses, *NEEDED})
-    yield vehicle, [_row(role, *statuses.get(role, ())) for role in everyone]
-    if notes := [{"role": role, "note": note} for role, each in sorted(statuses.items()) for note in _notes(*each)]:
+def role_sheets(statuses: Mapping[str, Status], vehicle: str) -> Sheets:
+    """The roles of one vehicle, each with its last status."""
+    yield vehicle, [_row(role, statuses.get(role)) for role in sorted({*statuses, *NEEDED})]
+    if notes := [{"role": role, "note": note} for role, each in sorted(statuses.items()) for note in _notes(each)]:
         yield "", notes
 
 
 def status_sheets(found: Gathered) -> Sheets:
     """Every vehicle's roles, as gathered."""
-    for vehicle, roles in sorted(found.statuses.items()):
-        yield from role_sheets({role: (status.age_s, status) for role, status in roles.items()}, vehicle)
+    for vehicle, statuses in sorted(found.statuses.items()):
+        yield from role_sheets(statuses, vehicle)
 
 
-def trouble_sheets(found: Gathered) -> Sheets:
+def trouble_sheets(found: Gathered, wrong: Sequence[Trouble]) -> Sheets:
     """A line for each trouble; without any, one for each vehicle."""
-    lines = [trouble.text for trouble in troubles(found)]
+    lines = [trouble.text for trouble in wrong]
     for vehicle, roles in sorted(found.statuses.items()) if not lines else []:
         states = ", ".join(f"{role} {status.state}" for role, status in sorted(roles.items()))
         lines.append(f"{vehicle} is well: {states}")
     yield "\n".join(lines), []
 
 
-def _row(role: str, age: float = 0.0, status: Status | None = None) -> Row:
-    """A role; without a status a missing one."""
+def _row(role: str, status: Status | None) -> Row:
+    if status is None:
+        columns = "rate 1/s", "skipped ticks", "latency p50/p99 µs", "answers in p50/p99 µs", "up"
+        return {"role": role, "state": "missing"} | dict.fromkeys(columns, "–")
 
     def p50_p99(spread: Percentiles | None) -> str:
         return f"{spread.p50:.0f}/{spread.p99:.0f}" if spread else "–"
 
     return {
         "role": role,
-        "state": "missing" if status is None else "silent" if age > SILENT_S else status.state,
-        "rate 1/s": f"{status.rate_hz:.0f}" if status else "–",
-        "skipped ticks": str(status.skipped) if status else "–",
-        "latency p50/p99 µs": p50_p99(status.latency_us if status else None),
-        "answers in p50/p99 µs": p50_p99(status.age_us if status else None),
-        "up": duration(status.uptime_s) if status else "–",
+        "state": "silent" if status.age_s > SILENT_S else status.state,
+        "rate 1/s": f"{status.rate_hz:.0f}",
+        "skipped ticks": str(status.skipped),
+        "latency p50/p99 µs": p50_p99(status.latency_us),
+        "answers in p50/p99 µs": p50_p99(status.age_us),
+        "up": duration(status.uptime_s),
     }
 
 
-def _notes(age: float, status: Status) -> Iterator[str]:
-    if age > SILENT_S:
-        yield f"no status for {duration(age)}, then {status.state}"
+def _notes(status: Status) -> Iterator[str]:
+    if status.age_s > SILENT_S:
+        yield f"no status for {duration(status.age_s)}, then {status.state}"
     if status.cause:
         since = f" ({status.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" if status.since else ""
         yield status.cause + since
@@ -71,8 +72,8 @@ def _notes(age: float, status: Status) -> Iterator[str]:
         if begins is not None and begins < status.ticks and (ends is None or status.ticks <= ends):
             yield f"{fault.fault} ({fault.source}): {fault.changed} {fault.effect}"
     if status.gains is not None:
-        gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in status.gains.named.items())
         yield f"reference {status.reference} ({status.reference_from})"
+        gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in status.gains.named.items())
         yield f"gains {gains} ({status.gains_from})"
 
 

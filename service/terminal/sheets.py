@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
 from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
@@ -29,34 +29,22 @@ def certificate_sheets(certificate: Certificate, verbose: bool = False) -> Sheet
         ("configured plant, at every instant", certificate.plant_radius, certificate.plant_deg),
         ("the same with θ̂ as first estimated", certificate.constant_radius, None),
     )
-    yield (
-        "",
-        [
-            {
-                "proven, in the end": what,
-                "‖z‖": "not proven" if radius is None else f"{radius:.4g}",
-                "attitude": "" if angle is None else f"{angle:.2f}°",
-            }
-            for what, radius, angle in proven
-        ],
-    )
+    bounds: list[Row] = []
+    for what, radius, angle in proven:
+        found = {"‖z‖": "not proven" if radius is None else f"{radius:.4g}"}
+        bounds.append({"proven, in the end": what, **found, "attitude": "" if angle is None else f"{angle:.2f}°"})
+    yield "", bounds
     if certificate.delay_ms is not None:
         lost = "" if certificate.lost_frames is None else f", or {certificate.lost_frames} frames lost in a row"
         yield f"It still holds with {certificate.delay_ms:.1f} ms of further delay{lost}.", []
     yield "\n  ".join(["Assumed:", *certificate.assumptions]), []
-    yield (
-        "",
-        [
-            {
-                "symbol": term.symbol,
-                "value": "–" if term.value is None else f"{term.value:.4g}",
-                "unit": term.unit,
-                "meaning": f"{term.meaning} ({term.equation})" if verbose else re.split("[;,]", term.meaning)[0],
-            }
-            for term in certificate.terms
-            if verbose or term.symbol in DECIDING
-        ],
-    )
+    terms: list[Row] = []
+    for term in certificate.terms:
+        if verbose or term.symbol in DECIDING:
+            value = "–" if term.value is None else f"{term.value:.4g}"
+            meaning = f"{term.meaning} ({term.equation})" if verbose else re.split("[;,]", term.meaning)[0]
+            terms.append({"symbol": term.symbol, "value": value, "unit": term.unit, "meaning": meaning})
+    yield "", terms
     if not verbose:
         yield f"--verbose prints all {len(certificate.terms)} terms, with their equations.", []
 
@@ -65,73 +53,53 @@ def wire_sheets(wire: WireSpec) -> Sheets:
     """A wire spec: each signal's quantizer, each frame's size."""
     rows, notes = list[Row](), list[str]()
     for name, signal, unit in (
-        ("ε attitude", wire.attitude, ""),
+        ("ε attitude", wire.attitude, "1"),
         ("ω rate", wire.rate, "rad/s"),
         ("u voltage", wire.voltage, "V"),
     ):
-        quantizer = signal.quantizer()
-        step, note = _steps(quantizer, f" {unit}".rstrip())
-        if note is not None:
-            notes.append(f"{name}: {note}")
+        quantizer, step = signal.quantizer(), "–"
+        if isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
+            step = f"{quantizer.step:.6g}"
+        if isinstance(quantizer, LogarithmicQuantizer):
+            grows = f"{quantizer.growing} steps grow from {quantizer.edges[1] - quantizer.edges[0]:.3g} {unit}"
+            notes.append(f"{name}: {grows} up to ±{quantizer.threshold:.6g} {unit}, the others are alike")
+        elif isinstance(quantizer, HysteresisQuantizer):
+            notes.append(f"{name}: a level is held for {quantizer.hysteresis:.6g} {unit} beyond its interval")
         kind, bits = ("–", "cont") if signal.bits is None else (signal.kind, str(signal.bits))
-        limit, error = f"±{signal.limit:g}", f"{quantizer.bound:.6g}"
-        rows.append(
-            {"signal": name, "kind": kind, "bits": bits, "limit": limit, "step": step, "largest error": error}
-            | {"unit": unit or "1"}
-        )
+        row = {"signal": name, "kind": kind, "bits": bits, "limit": f"±{signal.limit:g}", "step": step}
+        rows.append(row | {"largest error": f"{quantizer.bound:.6g}", "unit": unit})
     yield "", rows
     for label, frame in (("measurement", wire.measurement), ("command", wire.command)):
         notes.append(f"{label}: {frame.bits} bits in {frame.size} bytes, {frame.counter_bits} of them the counter")
     yield "\n".join(notes), []
 
 
-def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:
-    """The step between levels, and a note on the kind's other parameters."""
-    if isinstance(quantizer, LogarithmicQuantizer):
-        least = quantizer.edges[1] - quantizer.edges[0]
-        return f"≤ {quantizer.step:.6g}", (
-            f"0 within ±{quantizer.deadzone:.6g}{unit}, then {quantizer.growing} steps that grow from {least:.3g}{unit}"
-            f" up to ±{quantizer.threshold:.6g}{unit}, and {quantizer.top - quantizer.growing} alike"
-        )
-    if isinstance(quantizer, HysteresisQuantizer):
-        note = f"a level is held for {quantizer.hysteresis:.6g}{unit} beyond its interval"
-        return f"{quantizer.step:.6g}", note
-    return (f"{quantizer.step:.6g}" if isinstance(quantizer, UniformQuantizer) else "–"), None
-
-
 def diagnosis_sheets(diagnosis: Diagnosis) -> Sheets:
     """Findings of the doctor, each with what to change, and the verdict."""
-    yield (
-        "",
-        [
-            {
-                "": "✓" if finding.good else "✗",
-                "checked": finding.what,
-                "found": finding.found,
-                "to change": "" if finding.good else finding.advice,
-            }
-            for finding in diagnosis.findings
-        ],
-    )
+    found: list[Row] = []
+    for finding in diagnosis.findings:
+        sign, advice = ("✓", "") if finding.good else ("✗", finding.advice)
+        found.append({"": sign, "checked": finding.what, "found": finding.found, "to change": advice})
+    yield "", found
     yield f"this machine {'holds' if diagnosis.holds else 'does not hold'} {diagnosis.rate_hz:g} Hz", []
 
 
 def key_sheets(folder: str, files: Sequence[KeyFile]) -> Sheets:
     """Certificates of a folder, and a line for each that cannot be used."""
-    yield (
-        folder,
-        [
+    found: list[Row] = []
+    for file in files:
+        of_one = file.role in (None, "authority")
+        found.append(
             {
                 "": "✗" if file.problem else "✓",
                 "file": file.file,
                 "role": file.role or "–",
-                "vehicle": file.vehicle or ("every" if file.role and file.role != "authority" else "–"),
+                "vehicle": file.vehicle or ("–" if of_one else "every"),
                 "name": file.name or "–",
                 "valid until": f"{file.valid_until:%Y-%m-%d}" if file.valid_until else "–",
-                "days left": f"{file.days_left:.{0 if abs(file.days_left) >= 1 else 1}f}" if file.days_left else "–",
+                "days left": f"{file.days_left:.0f}" if file.days_left is not None else "–",
             }
-            for file in files
-        ],
-    )
+        )
+    yield folder, found
     if problems := [file.problem for file in files if file.problem]:
         yield "\n".join(problems), []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, Literal, TypeAlias
 
 import typer
@@ -29,13 +29,9 @@ _GAP: Final = 2
 
 
 def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
-    """Print rows, all with the same columns, and a title; without rows the title is a paragraph.
+    """Print rows, all with the same columns, below a title; without rows the title is a paragraph.
 
-    Args:
-        rows: From column to text.
-        title: Above the table, in a terminal and in Markdown.
-        form: For a person or for a document.
-        keys: So many first columns name a row: each block has them where a terminal is too narrow for all columns.
+    So many first columns (`keys`) name a row: each block has them where a terminal is too narrow for all columns.
     """
     if form == "markdown":
         typer.echo("\n".join(_markdown(rows, title)))
@@ -64,37 +60,38 @@ def _markdown(rows: Sequence[Row], title: str) -> list[str]:
     if not rows:
         return [title]
     heading = [f"**{title}**", ""] if title else []
-    rule = "".join("|--:" if right else "|---" for right in _right(rows))
-    return [*heading, *(f"| {' | '.join(cells)} |" for cells in (rows[0],)), f"{rule}|",
-            *(f"| {' | '.join(row.values())} |" for row in rows)]  # fmt: skip
+    rule = "".join("|--:" if _right(rows, name) else "|---" for name in rows[0])
+    head, *lines = (f"| {' | '.join(cells)} |" for cells in (rows[0], *(row.values() for row in rows)))
+    return [*heading, head, f"{rule}|", *lines]
 
 
-def _right(rows: Sequence[Row]) -> list[bool]:
-    """Which columns hold numbers, and no longer words, and so stand to the right: never the first."""
-
-    def numbers(column: str) -> bool:
-        cells = [row[column] for row in rows if row[column] not in ("–", "", "none")]
-        return all(re.search(r"\d", cell) and not re.search(r"[^\W\d_]{4}", cell) for cell in cells)
-
-    return [i > 0 and numbers(column) for i, column in enumerate(rows[0])]
+def _right(rows: Sequence[Row], column: str) -> bool:
+    """Whether a column holds numbers, and no longer words, and so stands to the right: never the first."""
+    cells = [row[column] for row in rows if row[column] not in ("–", "", "none")]
+    numbers = all(re.search(r"\d", cell) and not re.search(r"[^\W\d_]{4}", cell) for cell in cells)
+    return numbers and column != next(iter(rows[0]))
 
 
-def _blocks(rows: Sequence[Row], width: int, keys: int) -> list[Table]:
+def _blocks(rows: Sequence[Row], width: int, keys: int) -> Iterator[Table]:
     least = {name: _least(rows, name, width) for name in rows[0]}
-    right = dict(zip(rows[0], _right(rows), strict=True))
-    tables = []
-    for columns in _split(least, width, keys):
-        drawn = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
-        whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in columns}
-        folds = sum(whole.values()) + _GAP * (len(columns) - 1) > width
-        for name in columns:
-            is_long = max(cell_len(row[name]) for row in rows) > least[name]
-            fixed = least[name] if folds and not is_long else None
-            drawn.add_column(name, justify="right" if right[name] else "left", width=fixed, min_width=least[name])
+    longest = {name: max(cell_len(row[name]) for row in rows) for name in rows[0]}
+    first = [*least][:keys]
+    blocks = [[*first]]
+    for name in [*least][keys:]:
+        used = sum(least[each] + _GAP for each in blocks[-1])
+        if len(blocks[-1]) > keys and used + least[name] > width:
+            blocks.append([*first])
+        blocks[-1].append(name)
+    for columns in blocks:
+        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
+        folds = sum(max(cell_len(name), longest[name]) + _GAP for name in columns) - _GAP > width
+        for name in columns:  # where not all fits, only titles and long texts fold
+            fixed = least[name] if folds and longest[name] <= least[name] else None
+            right = _right(rows, name)
+            table.add_column(name, justify="right" if right else "left", width=fixed, min_width=least[name])
         for row in rows:
-            drawn.add_row(*(Text(row[name], style=STYLES.get(row[name], "")) for name in columns))
-        tables.append(drawn)
-    return tables
+            table.add_row(*(Text(row[name], style=STYLES.get(row[name], "")) for name in columns))
+        yield table
 
 
 def _least(rows: Sequence[Row], name: str, available: int) -> int:
@@ -103,15 +100,3 @@ def _least(rows: Sequence[Row], name: str, available: int) -> int:
     folding = [text for text in cells if cell_len(text) > available / 3]
     whole = [] if folding else cells
     return max(map(cell_len, (*whole, *(word for text in (name, *folding) for word in text.split()), "")))
-
-
-def _split(least: Mapping[str, int], available: int, keys: int) -> list[list[str]]:
-    """Columns of each block: all in one where they fit beside each other."""
-    first, *others = [*least][:keys], *[*least][keys:]
-    blocks = [[*first]]
-    for name in others:
-        width = sum(least[each] for each in blocks[-1]) + _GAP * len(blocks[-1]) + least[name]
-        if len(blocks[-1]) > keys and width > available:
-            blocks.append([*first])
-        blocks[-1].append(name)
-    return blocks

@@ -1,8 +1,8 @@
 """Hardware-in-the-loop tests: runs controller, plant and recorder as a process group, operates it and injects faults.
 
-The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too, in a script with the usual
-`if __name__ == "__main__":`. In real time `run` sleeps; in lockstep the plant takes an exact number of steps, and what
-an operator requests between two of them holds from the next tick on, so a test repeats bit for bit on a busy machine.
+The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too. In real time `run` sleeps; in lockstep
+the plant takes an exact number of steps, and what an operator requests holds from the next tick on, so a test repeats
+bit for bit on a busy machine.
 """
 
 from __future__ import annotations
@@ -50,15 +50,12 @@ class Hil:
     def __init__(
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
     ) -> None:
-        self._folder = folder
-        self._kind = None if plant in PLANTS else plant
-        self._via = "emulator" if self._kind else plant.replace("can-node", "can")
+        self._folder, self._lockstep, self._config = folder, lockstep, config
+        self._plant = {"plant.via": plant.replace("can-node", "can")}
+        if plant not in PLANTS:
+            self._plant = {"plant.via": "emulator", "plant.kind": plant}
         self._private_bus = plant == "can-node"
-        self._config = config
-        self._lockstep = lockstep
-        self._settings: Settings | None = None
         self._processes: ProcessGroup | None = None
-        self._running = False
         self._logs: list[HilLog] = []
         self._requested_ticks = 0
         self._may_advance = 0.0  # from when on the plant answers another such query, on the monotonic clock [s]
@@ -93,9 +90,8 @@ class Hil:
             "controller.require_recorder": True,
             "controller.after_restart": "configured",
             "loop.lockstep": self._lockstep,
-            "plant.steps_on_request": self._lockstep and self._via == "emulator",
-            "plant.via": self._via,
-            **({"plant.kind": self._kind} if self._kind else {}),
+            "plant.steps_on_request": self._steps,
+            **self._plant,
         }
         try:
             overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
@@ -104,22 +100,22 @@ class Hil:
             raise HilError(str(error)) from None
         if self._private_bus:
             loaded = loaded.model_copy(update={"can": private_bus(loaded.can)})
-        self._settings = loaded
         self._requested_ticks = 0
         self._processes = ProcessGroup(loaded, log.with_suffix(""))
-        self._running = True
         self._logs.append(HilLog(log))
         self.processes.start_loop(drive=drive)
         if drive:
             self.eventually("the controller drives the plant", self._closed)
 
+    @property
+    def _steps(self) -> bool:  # on request only
+        return self._lockstep and self._plant["plant.via"] == "emulator"
+
     def run(self, seconds: float) -> None:
         """Run the loop for a time; in lockstep for that many steps, or until the session ends.
 
         In lockstep an emulator stops between two calls; other plants run on, so they take at least that many steps.
-
-        Raises:
-            HilError: A process has failed or, in lockstep, the plant does not step in time.
+        Raises HilError if a process has failed or, in lockstep, the plant does not step in time.
         """
         self._check_running()
         if not self._lockstep:
@@ -128,7 +124,7 @@ class Hil:
             return
         steps = self.settings.loop.ticks(seconds)
         self._requested_ticks += steps
-        if self._via == "emulator":
+        if self._steps:
             self._advance(seconds)
 
         def over() -> bool:
@@ -161,11 +157,9 @@ class Hil:
         return self.track(Hold(attitude=(roll, pitch, yaw)), in_s)
 
     def track(self, reference: Reference | Mapping[str, Any] | Path, in_s: float | None = None) -> str:
-        """Follow another reference, as `aeroloop op track`.
+        """Follow a reference, a table as of `[reference]`, or a CSV file of points, as `aeroloop op track`.
 
-        Args:
-            reference: A reference, a table as of `[reference]` (`{"kind": "sinusoid", …}`), or a CSV file of points.
-            in_s: Time to reach it, as of `--in` [s]; None for the shortest within the limits.
+        `in_s` is the time to reach it [s]; None for the shortest within the limits.
         """
         followed = read_points(reference) if isinstance(reference, Path) else reference
         return self._operate("track", Track, reference=followed, within_s=in_s)
@@ -175,10 +169,7 @@ class Hil:
         return self._operate("set_gains", Gains, **gains)
 
     def inject(self, fault: str | None) -> str:
-        """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
-
-        None clears all faults.
-        """
+        """Inject `signal:kind[=value][@start[..end]]`, times in s from now, into the plant; None clears all faults."""
         return self._operate("inject", Inject, faults=[fault] if fault else [], clear=fault is None)
 
     # ── processes ──
@@ -237,9 +228,7 @@ class Hil:
     @property
     def settings(self) -> Settings:
         """The configuration. Raises HilError before `start`."""
-        if self._settings is None:
-            raise HilError("nothing was started: call `hil.start()` first")
-        return self._settings
+        return self.processes.settings
 
     @property
     def processes(self) -> ProcessGroup:
@@ -251,22 +240,16 @@ class Hil:
     @property
     def log(self) -> HilLog:
         """The log since `start`, or since the recorder's last restart. Reading it ends the run."""
-        self.finish()
-        if not self._logs:
-            raise HilError("nothing was started, so there is no log: call `hil.start()` first")
+        self.processes.close()
         return self._logs[-1]
 
     def finish(self) -> None:
         """Stop all processes and close the log."""
-        if self._running:
-            self._running = False
-            self.processes.__exit__(None, None, None)
+        if self._processes is not None:
+            self._processes.close()
 
     def evidence(self) -> list[str]:
-        """Stop all processes and write what explains a failure beside each log: page and events.
-
-        Returns a line for each file: its path and what it is. Configuration and output of daemons are there already.
-        """
+        """Stop all processes, write page and events beside each log, and return a line for each file there."""
         self.finish()
         lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]
         outputs = sorted(output for log in self._logs for output in log.path.with_suffix("").glob("*.txt"))
@@ -280,7 +263,7 @@ class Hil:
         return plant.session is not None and plant.session == controller.session
 
     def _check_running(self) -> None:
-        if self.processes and not self._running:
+        if self.processes.closed:
             raise HilError("the run has ended, as reading `hil.log` ends it: call `hil.start()` for another")
 
     def _operate(self, topic: str, model: type[Message], **values: Any) -> str:

@@ -51,9 +51,9 @@ class HilLog:
     @property
     def figures(self) -> RunFigures:
         """Figures of the longest session, from the log alone; its `sessions` says how many there are."""
-        return self.figures_of(None)
+        return self.figures_of()
 
-    def figures_of(self, session: int | None) -> RunFigures:
+    def figures_of(self, session: int | None = None) -> RunFigures:
         """Figures of a session, by its number from 1 in the order of recording. Raises HilError if there is none."""
         try:
             return RunFigures(read(self._existing(), session=None if session is None else str(session)).findings)
@@ -109,29 +109,26 @@ class HilLog:
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:
         """Write page and events beside the log; yield a line for each file, or the reason why there is none.
 
-        Args:
-            received: Events received while the loop ran, for a log that cannot be read.
+        `received` are the events received while the loop ran, for a log that cannot be read.
         """
         if not self.path.exists():
             yield f"{self.path}: no log was written"
             return
         yield f"{self.path}: the log"
         events, shown = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
-        timed: list[tuple[int, Event]] = []
+        lines = [_line(event) for event in received]
         with suppress(Exception):  # whatever a broken log makes its reader raise
             timed = self.messages(Event)
-        lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
-        lines = lines or [_line(event) for event in received]
+            lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed] or lines
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:
             from aeroloop.service.report.page import page
 
             shown.write_text(page([read(self.path).report()]), encoding="utf-8")
+            yield f"{shown}: the review as a page"
         except Exception as error:  # the same; and without the extra `review` there is no page
             yield f"no page: {type(error).__name__}: {error}".splitlines()[0]
-        else:
-            yield f"{shown}: the review as a page"
 
     def _existing(self) -> Path:
         if not self.path.exists():

@@ -1,8 +1,8 @@
 """Process group: starts, watches and stops roles as child processes, for the demo, `hil`, the tests and the benchmarks.
 
-Each child runs the command that a user would type, with the effective configuration in a temporary file. It is a fork
-of multiprocessing's server, which has imported everything, because imports take over half a second of a core. A child
-ends when this process ends, however that ends. ^C reaches only this process, which stops its children one by one.
+Each child runs the command that a user would type, with the effective configuration in a file. It is a fork of
+multiprocessing's server, which has imported everything. A child ends when this process ends, however that ends. ^C
+reaches only this process, which stops its children one by one.
 """
 
 from __future__ import annotations
@@ -41,17 +41,12 @@ RoleName = Literal["controller", "plant", "can-node", "recorder"]
 """In the order of stopping."""
 
 PRELOADED: Final = (
-    "aeroloop.service.cli.main",
-    "aeroloop.service.daemon.daemon",
-    "aeroloop.service.daemon.roles",
-    "aeroloop.service.recording.recorder",
-    "aeroloop.service.testing.process_group",
-    "aeroloop.service.theorem.certificate",
-    "aeroloop.service.viewers.channels",
-    "aeroloop.plant_emulator.hosts.can_node",
-    "casadi",  # the modules above import it at its first use
-)
-"""Modules that the fork server imports, once for all children."""
+    "aeroloop.service.cli.main", "aeroloop.service.daemon.daemon", "aeroloop.service.daemon.roles",
+    "aeroloop.service.recording.recorder", "aeroloop.service.testing.process_group",
+    "aeroloop.service.theorem.certificate", "aeroloop.service.viewers.channels",
+    "aeroloop.plant_emulator.hosts.can_node", "casadi",  # these modules import it at its first use
+)  # fmt: skip
+"""Modules that the fork server imports, once for all children: they take over half a second of a core."""
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
 PATIENCE_S: Final = 30.0
@@ -69,8 +64,8 @@ class HilError(AeroloopError):
 def start_command(words: Sequence[str], output: Path, environment: Mapping[str, str] | None = None) -> BaseProcess:
     """Run `aeroloop` with these words in a process and a session of its own; its stderr goes to the end of a file.
 
-    It is a fork of the server; with additions to the environment, even none, it is a new interpreter, because the
-    dynamic linker reads them at its start. Variables of the configuration are not passed on.
+    With additions to the environment, even none, it is a new interpreter: the dynamic linker reads them at its start.
+    Variables of the configuration are not passed on.
     """
     multiprocessing.set_forkserver_preload([*PRELOADED])
     context: Any = multiprocessing.get_context("forkserver" if environment is None else "spawn")
@@ -139,13 +134,7 @@ def private_bus(can: CanSettings) -> CanSettings:
 def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
     """The settings of a loop that arms and moves by itself and records to a new log, on a free rendezvous and bus.
 
-    Args:
-        settings: Those of the user.
-        log: Path of the log.
-        controller: Keys of `[controller]` that this loop has otherwise.
-
-    Raises:
-        HilError: The log exists.
+    `controller` are keys of `[controller]`. Raises HilError if the log exists.
     """
     if parts(log):
         raise HilError(f"{log} exists, and a log is never written over; name another with --log PATH")
@@ -173,13 +162,14 @@ class ProcessGroup:
         self._folder.mkdir(parents=True, exist_ok=True)
         # A stop or a trip outlives its process here, and surprises no other group.
         plant = settings.plant.model_copy(update={"state_directory": self._folder.absolute() / "state"})
-        self._settings = settings = settings.model_copy(update={"plant": plant})
+        self.settings = settings = settings.model_copy(update={"plant": plant})
         self._config = self._folder / "aeroloop.toml"
         self._config.write_text(settings.toml())
         self._children: dict[str, BaseProcess] = {}
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = Condition()
+        self.closed = False
         self.statuses: dict[str, Status] = {}
         self.events: list[Event] = []
         self.telemetry: Telemetry | None = None
@@ -192,21 +182,25 @@ class ProcessGroup:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for role in get_args(RoleName):
-            if role in self._children:
-                self.stop(role)
-        self.zenoh.close()
-        self._cleanup.close()
+        self.close()
+
+    def close(self) -> None:
+        """Stop all processes; a second call does nothing."""
+        if not self.closed:
+            self.closed = True
+            for role in get_args(RoleName):
+                if role in self._children:
+                    self.stop(role)
+            self.zenoh.close()
+            self._cleanup.close()
 
     def start_loop(self, *, drive: bool = True, environment: Mapping[str, str] | None = None) -> None:
-        """Start recorder, plant end, a node on a bus that is software, and a controller; wait for recorder and plant.
+        """Start recorder, plant end, a node on a bus that is software, and to drive it a controller.
 
-        Args:
-            drive: Whether to start a controller, which claims once both are there.
-            environment: As of `start_command`.
+        Waits for recorder and plant; `environment` is as of `start_command`.
         """
         roles: list[RoleName] = ["recorder", "plant"]
-        if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
+        if self.settings.plant.via == "can" and self.settings.can.interface == "udp_multicast":
             roles.insert(1, "can-node")
         if drive:
             roles.append("controller")
@@ -233,11 +227,9 @@ class ProcessGroup:
             while not condition():
                 self.check()
                 if time.monotonic() > deadline:
-                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
-                    raise HilError(
-                        f"not within {timeout_s:g} s: {what} ({self.states or 'no status was received'}"
-                        f"{f'; last events: {last}' if last else ''})"
-                    )
+                    last = [f"; {event.role} {event.kind}: {event.text}" for event in self.events[-3:]]
+                    states = self.states or "no status was received"
+                    raise HilError(f"not within {timeout_s:g} s: {what} ({states}{''.join(last)})")
                 self._changed.wait(0.05)
 
     @property
@@ -281,7 +273,9 @@ class ProcessGroup:
             if child.exitcode and role not in self._killed:
                 lines = self._output(role).read_text(errors="replace").strip().splitlines()
                 last = next((f": {line}" for line in reversed(lines) if " INFO " not in line), "")
-                raise HilError(f"the {role} ended with exit code {child.exitcode}{last}")
+                failure = HilError(f"the {role} ended with exit code {child.exitcode}{last}")
+                failure.exit_code = 2 if child.exitcode == 2 else 1  # its configuration is wrong
+                raise failure
 
     def _output(self, role: str) -> Path:
         return self._folder / f"{role}.txt"
@@ -299,8 +293,8 @@ class ProcessGroup:
                     self.events.append(Event.model_validate_json(content))
                 case "telemetry":
                     self.telemetry = Telemetry.model_validate_json(content)
-                case _ if address.role is not None and sample.kind == zenoh.SampleKind.PUT:
-                    self._alive.add(address.role)
-                case _ if address.role is not None:
-                    self._alive.discard(address.role)
+                case "alive" if sample.kind == zenoh.SampleKind.PUT:
+                    self._alive.add(address.role or "")
+                case "alive":
+                    self._alive.discard(address.role or "")
             self._changed.notify_all()

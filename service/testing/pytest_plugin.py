@@ -1,7 +1,6 @@
-"""Pytest plugin: provides the `hil` fixture, a closed loop of real processes.
+"""Pytest plugin: provides the `hil` fixture, a closed loop of real processes, and evidence of a failed test.
 
-Active once the package is installed. It imports the loop's modules only when a test uses the fixture. The report of a
-failed test names the files that explain it: log, page, events and the daemons' output, in the test's temporary folder.
+It imports the loop's modules only when a test uses the fixture.
 """
 
 from __future__ import annotations

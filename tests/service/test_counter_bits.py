@@ -26,26 +26,20 @@ def test_a_counter_counts_twice_the_watchdog_and_the_stale_time_or_the_refusal_s
     if 2**bits >= needed:
         assert load(overrides=[*loop, f"wire.counter_bits={bits}"]).wire.counter_bits == bits
         return
-    with pytest.raises(ConfigError, match=rf"^wire\.counter_bits = {bits} counts ") as refused:
+    name = "plant.watchdog_s" if watchdog >= stale else "controller.stale_s"
+    with pytest.raises(ConfigError, match=rf"^wire\.counter_bits = {bits} counts .*{name}") as refused:
         load(overrides=[*loop, f"wire.counter_bits={bits}"])
-    reason = str(refused.value)
-    assert "\n" not in reason
-    assert ("plant.watchdog_s" if watchdog >= stale else "controller.stale_s") in reason
-    assert "can." not in reason
-    if found := re.search(r"set it to (\d+)$", reason):
+    if found := re.search(r"set it to (\d+)$", str(refused.value)):
         least = int(found[1])
         assert 2 ** (least - 1) < needed <= 2**least
         assert load(overrides=[*loop, f"wire.counter_bits={least}"]).wire.counter_bits == least
     else:
         assert needed > 2**16
-        assert re.search(r"16 bits are too few; shorten \S+, or lower loop\.rate_hz$", reason)
+        assert f"16 bits are too few; shorten {name}, or lower loop.rate_hz" in str(refused.value)
 
 
-def test_in_lockstep_any_counter_will_do() -> None:
+def test_a_short_counter_is_accepted_in_lockstep_and_on_a_can_bus_whose_frame_holds_no_longer_one() -> None:
     assert load(overrides=["wire.counter_bits=4", "loop.lockstep=true"]).wire.counter_bits == 4
-
-
-def test_a_short_counter_is_accepted_on_a_can_bus_whose_frame_holds_no_longer_one_and_nowhere_else() -> None:
     ten_bits = ("wire.attitude.bits=10", "wire.rate.bits=10", "wire.counter_bits=4")
     assert load(overrides=["plant.via=can", *ten_bits]).wire.counter_bits == 4
     for others in (ten_bits, ["plant.via=can", "can.fd=true", *ten_bits], ["plant.via=can", "wire.counter_bits=4"]):

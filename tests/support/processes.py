@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,17 @@ PATIENT: Final = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
 LONGEST_S: Final = 120.0  # for a command that takes up to 10 s here; CI may have other work
+
+
+def sessions() -> dict[int, int]:
+    """The session of each process by its id, but for those that have ended and that nothing has waited for."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has just ended
+            state, _, _, session, *_ = path.read_text().rsplit(")", 1)[1].split()
+            if state != "Z":
+                found[int(path.parent.name)] = int(session)
+    return found
 
 
 def aeroloop(*words: str, code: int | None = 0, cwd: Path | None = None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -17,23 +16,14 @@ from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host import doctor
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
+from tests.support.processes import AEROLOOP
 
 pytestmark = pytest.mark.processes
 
 
 def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_reported() -> None:
     """In a process of its own, which becomes real-time. The verdict is this machine's: only its reasons are checked."""
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "aeroloop",
-        "host",
-        "doctor",
-        "--json",
-        "--set",
-        "loop.rate_hz=100",
-    ]
+    command = [*AEROLOOP, "host", "doctor", "--json", "--set", "loop.rate_hz=100"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     diagnosis = json.loads(done.stdout)
     assert done.returncode == (0 if diagnosis["holds"] else 1)
@@ -54,7 +44,7 @@ def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) ->
         return wait(grid)
 
     monkeypatch.setattr(TickGrid, "wait", stalling)
-    diagnosis = doctor.diagnose(LoopSettings(rate_hz=100.0))
+    diagnosis = doctor.diagnose(LoopSettings(rate_hz=100.0), NetworkSettings())
     assert not diagnosis.holds
     assert diagnosis.skipped > 0
     assert not diagnosis.findings[-1].good

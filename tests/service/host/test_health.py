@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -17,86 +18,59 @@ from tests.support.clock import FakeClock
 from tests.support.zenoh_network import Gathering, eventually
 
 PERIOD = Percentiles(count=5000, p50=2000, p99=2100, p999=2200, max=2300)
-
-
-def status(role: str, state: str, **more: Any) -> Status:
-    timing = Timing(
-        wake=None, busy=None, period=None, recent_wake=None, recent_busy=None, recent_period=PERIOD
-    )  # fmt: skip
-    return Status(role=role, state=state, uptime_s=60, ticks=1, rate_hz=500, skipped=0, timing=timing, **more)
-
-
-CONTROLLER, PLANT = status("controller", "running"), status("plant", "driven")
-
-
-def of(controller: Status | None = CONTROLLER, plant: Status | None = PLANT, *silent: str) -> list[Trouble]:
-    roles = {role: one for role, one in (("controller", controller), ("plant", plant)) if one is not None}
-    return troubles(Gathered({"aero": roles}, list(silent)))
-
-
-def test_a_loop_that_is_driven_in_time_is_well() -> None:
-    assert of() == []
-    assert troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT}}, [])) == []  # without a recorder
-
-
-def with_recorder(state: str, **more: Any) -> list[Trouble]:
-    recorder = status("recorder", state, **more)
-    return troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
-
-
 SLOW = PERIOD.model_copy(update={"p99": PERIOD.p50 + 1})
 LATE = int(LATE_SHARE * PERIOD.count) + 1
 
 
+def status(role: str, state: str, **more: Any) -> Status:
+    timing = Timing(wake=None, busy=None, period=None, recent_wake=None, recent_busy=None, recent_period=PERIOD)
+    return Status.model_validate(
+        {"role": role, "state": state, "uptime_s": 60, "ticks": 1, "rate_hz": 500, "skipped": 0, "timing": timing}
+        | more
+    )
+
+
+def of(*roles: Status, silent: Sequence[str] = ()) -> list[Trouble]:
+    """Troubles of a vehicle with these roles; of a controller and a plant that are well where none is given."""
+    well = {"controller": status("controller", "running"), "plant": status("plant", "driven")}
+    return troubles(Gathered({"aero": well | {each.role: each for each in roles}}, [*silent]))
+
+
 @pytest.mark.parametrize(
-    ("found", "kind", "role", "says"),
+    ("changed", "kind", "says"),
     [
-        (of(plant=status("plant", "tripped", cause="no command for 100 ms")), "tripped", "plant", "no command for 100"),
-        (of(controller=status("controller", "faulted")), "faulted", "controller", "op arm"),
-        (of(plant=status("plant", "driven", age_s=SILENT_S + 1)), "silent", "plant", "no status for 4 s"),
-        (of(controller=status("controller", "running", recent_skipped=LATE)), "late", "controller", "51 ticks"),
-        (of(plant=status("plant", "driven", recent_latency_us=SLOW)), "late", "plant", "2001 µs"),
-        (of(controller=None), "missing", "controller", "aero has no controller"),
-        (of(plant=None), "missing", "plant", "aero has no plant"),
-        (of(plant=status("plant", "driven", unkept="read-only")), "not kept", "plant", "forget a stop at a restart"),
-        (of(plant=status("plant", "tripped", unkept="read-only")), "tripped", "plant", "forget it: read-only"),
-        (of(plant=status("plant", "driven", lacks_recorder="gone")), "missing", "recorder", "recorder is gone"),
-        (of(status("controller", "searching", lacks_recorder="required")), "missing", "recorder", "requires one"),
-        (
-            of(
-                status("controller", "running", lacks_recorder="required"),
-                status("plant", "driven", lacks_recorder="gone"),
-            ),
-            "missing",
-            "recorder",
-            "recorder is gone",
-        ),
-        (
-            with_recorder(NOT_RECORDING, cause="the disk is full"),
-            "not recording",
-            "recorder",
-            "nothing: the disk is full",
-        ),
-        (with_recorder("recording", lost=7), "lossy", "recorder", "lost 7 messages"),
-        (of(CONTROLLER, PLANT, "the recorder at x does not answer"), "silent", None, "recorder at x"),
+        (status("plant", "tripped", cause="no command for 100 ms"), "tripped", "no command for 100"),
+        (status("controller", "faulted"), "faulted", "op arm"),
+        (status("plant", "driven", age_s=SILENT_S + 1), "silent", "no status for 4 s"),
+        (status("plant", "tripped", age_s=60, recent_skipped=LATE), "silent", "no status"),  # nothing older is said
+        (status("controller", "running", recent_skipped=LATE), "late", "51 ticks"),
+        (status("plant", "driven", recent_latency_us=SLOW), "late", "2001 µs"),
+        (status("plant", "driven", unkept="read-only"), "not kept", "forget a stop at a restart"),
+        (status("plant", "tripped", unkept="read-only"), "tripped", "forget it: read-only"),
+        (status("plant", "driven", lacks_recorder="gone"), "missing", "recorder is gone"),
+        (status("controller", "searching", lacks_recorder="required"), "missing", "requires one"),
+        (status("recorder", NOT_RECORDING, cause="the disk is full"), "not recording", "nothing: the disk is full"),
+        (status("recorder", "recording", lost=7), "lossy", "lost 7 messages"),
     ],
 )
-def test_each_trouble_is_named_with_its_role(found: list[Trouble], kind: str, role: str | None, says: str) -> None:
-    (trouble,) = found
-    assert (trouble.kind, trouble.role) == (kind, role)
+def test_each_trouble_is_named_with_its_role(changed: Status, kind: str, says: str) -> None:
+    (trouble,) = of(changed)
+    assert trouble.kind == kind
+    assert trouble.role == ("recorder" if changed.lacks_recorder else changed.role)
     assert says in trouble.text
 
 
-def test_of_a_role_that_is_silent_nothing_older_is_said() -> None:
-    tripped = status("plant", "tripped", age_s=60, recent_skipped=LATE)
-    assert [trouble.kind for trouble in of(plant=tripped)] == ["silent"]
-
-
-def test_what_skips_and_delays_within_the_limits_is_not_late() -> None:
+def test_what_is_missing_or_does_not_answer_is_named_and_what_is_within_the_limits_is_well() -> None:
+    assert [each.text for each in troubles(Gathered({"aero": {}}, []))] == [
+        "aero has no controller", "aero has no plant",
+    ]  # fmt: skip
+    assert [each.text for each in of(silent=["the recorder at x does not answer"])] == [
+        "the recorder at x does not answer"
+    ]
     within = {"recent_skipped": LATE - 1, "recent_latency_us": PERIOD.model_copy(update={"p99": PERIOD.p50})}
-    assert of(plant=status("plant", "driven", **within)) == []
-    lockstep = CONTROLLER.model_copy(update={"timing": None, "recent_skipped": LATE})
-    assert of(controller=lockstep) == []
+    assert of(status("plant", "driven", **within)) == []
+    assert of(status("controller", "running", timing=None, recent_skipped=LATE)) == []  # in lockstep
+    assert of() == []  # without a recorder
 
 
 def test_a_loop_that_hangs_is_known_by_the_age_of_its_status(capfd: pytest.CaptureFixture[str]) -> None:
@@ -130,7 +104,7 @@ def test_skipped_ticks_are_counted_over_the_last_ten_seconds(monkeypatch: pytest
         monkeypatch.setattr(role, "publish", lambda _, message: published.append(message.recent_skipped))
         for at, skipped in ((100, 7), (105, 9), (110, 9), (111, 9), (116, 10)):
             clock.now_ns = at * 10**9
-            role.status(PLANT.model_copy(update={"skipped": skipped}))
+            role.status(status("plant", "driven", skipped=skipped))
     assert published == [0, 2, 2, 0, 1]
 
 

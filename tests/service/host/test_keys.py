@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 import stat
-from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.transport.certificate import CertificateError, load, own_certificate, read_certificate
+from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host import keys
 from aeroloop.service.host.doctor import certificate_findings
 from tests.support.certificates import DAY, Authority, common_name
+
+
+def of(folder: Path) -> NetworkSettings:
+    return NetworkSettings(security=SecuritySettings(directory=str(folder)))
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -41,31 +43,18 @@ def test_what_is_issued_can_be_used_for_ninety_days(folder: Path, role: str, veh
     assert load(file).subject.rfc4514_string() == f"OU=lab 2,CN={common_name(role, vehicle)}"
 
 
-def test_keys_are_the_owners_alone(folder: Path) -> None:
+def test_keys_are_the_owners_alone_and_nothing_is_overwritten(folder: Path) -> None:
     keys.issue(folder, "operator", "Ada")
-    keys.issue(folder, "observer", "Ada")
-    secrets = [path for path in folder.iterdir() if b"PRIVATE" in path.read_bytes()]
-    assert len(secrets) == 3
-    assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    before = files(folder)
+    secrets = [folder / name for name, content in before.items() if b"PRIVATE" in content]
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (folder, *secrets)] == [0o700, 0o600, 0o600]
+    for again in (keys.init, lambda folder: keys.issue(folder, "operator", "Eve")):
+        with pytest.raises(CertificateError, match="is not overwritten"):
+            again(folder)
+    assert files(folder) == before
     (folder / "open").mkdir(mode=0o755)
     with pytest.raises(CertificateError, match="chmod 700"):
         keys.init(folder / "open")
-
-
-@pytest.mark.parametrize(
-    "again",
-    [
-        keys.init,
-        lambda folder: keys.issue(folder, "operator", "Eve"),
-    ],
-)
-def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -> None:
-    keys.issue(folder, "operator", "Ada")
-    before = files(folder)
-    with pytest.raises(CertificateError, match="is not overwritten"):
-        again(folder)
-    assert files(folder) == before
 
 
 def test_no_certificate_outlives_its_authority(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,10 +90,6 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     authority = Authority(tmp_path / "keys", days=100)
     authority.issue("plant", "aero", ends=50 * DAY)
     authority.issue("operator", ends=13 * DAY)
-    findings = {finding.what: finding for finding in certificate_findings(authority.folder)}
-    assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
-    assert "13 days left" in findings["operator.pem"].found
-    assert "keys issue" in findings["operator.pem"].advice
     words = ["host", "keys", "show", "--json", "--directory", str(authority.folder)]
     assert run(words) == 0
     authority.issue("observer", ends=-DAY)
@@ -113,30 +98,15 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     assert "expired" in rows["observer.pem"]["problem"]
     assert rows["plant.aero.pem"]["problem"] is None
     assert 49 < rows["plant.aero.pem"]["days_left"] < 51
-    assert not {finding.what: finding for finding in certificate_findings(authority.folder)}["observer.pem"].good
-    (missing,) = certificate_findings(tmp_path)
+    findings = {finding.what: finding for finding in certificate_findings(of(authority.folder))}
+    assert [name for name, finding in findings.items() if not finding.good] == ["observer.pem", "operator.pem"]
+    assert findings["operator.pem"].found == "13 days left"
+    assert "keys issue" in findings["operator.pem"].advice
+    (missing,) = certificate_findings(of(tmp_path))
     assert not missing.good
     monkeypatch.setenv("COLUMNS", "120")
     assert run([*words[:3], *words[4:]]) == 1
     assert "observer.pem expired" in capfd.readouterr().out
-
-
-@pytest.mark.parametrize(("days", "said"), [(13, True), (15, False)])
-def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
-    days: int, said: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
-    from datetime import UTC, datetime
-
-    from aeroloop.service.host.operator import Gathered
-    from aeroloop.service.terminal.roles import status_sheets
-    from aeroloop.service.terminal.show import show_all
-
-    until = datetime.now(UTC) + timedelta(days=days)
-    status = Status(
-        role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, certificate_until=until
-    )  # fmt: skip
-    show_all(status_sheets(Gathered({"aero": {"plant": status}}, [])))
-    assert (f"expires at {until:%Y-%m-%d}" in capfd.readouterr().out) == said
 
 
 def test_the_command_line_makes_what_two_hosts_need(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

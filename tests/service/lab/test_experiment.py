@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.config import Settings, bits_overrides, load, load_over
 from aeroloop.service.lab.experiment import run_experiment
 from tests.support.ideal import IDEAL
 
 
 def test_the_ideal_plant_without_quantization_tracks_as_the_paper_lets_expect() -> None:
-    found = run_experiment(with_bits(load(overrides=IDEAL), "cont/cont"), 50.0)  # s, as in the paper, C.5.2
+    found = run_experiment(
+        load_over(load(overrides=IDEAL), bits_overrides("cont/cont")), 50.0
+    )  # s, as in the paper, C.5.2
     # The ideal plant gives some 4e-4, against 35e-4 on the bench; 9e-4 still distinguishes the two and leaves room for
     # other damping. u_total is 6600–6750 there; 1.5–2 % to each side.
     assert 1e-4 < (found.z_track or 0) < 9e-4

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from io import StringIO
 
+import pytest
 from rich.console import Console
 
-from aeroloop.protocol.messages.models import Event, Percentiles, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import Event, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.host.health import SILENT_S
 from aeroloop.service.terminal.monitor import Top
@@ -67,13 +69,12 @@ def test_attitude_error_volts_and_events_are_shown() -> None:
         assert words in shown
 
 
-def test_error_and_voltages_of_a_session_that_is_over_are_not_shown() -> None:
-    assert "+12.5" in driven().text()
-    for plant in (status("plant", "tripped", session=None), status("plant", "driven", session="another")):
-        view = driven()
-        view.receive(status__plant=plant)
-        assert "12.5" not in view.text()
-        assert "1.00°" not in view.text()
+@pytest.mark.parametrize("plant", [("tripped", None), ("driven", "another")])
+def test_error_and_voltages_of_a_session_that_is_over_are_not_shown(plant: tuple[str, str | None]) -> None:
+    view = driven()
+    assert "+12.5" in view.text()
+    view.receive(status__plant=status("plant", plant[0], session=plant[1]))
+    assert not any(words in view.text() for words in ("12.5", "1.00°"))
 
 
 def test_what_is_no_longer_published_is_shown_as_silent_with_its_age() -> None:
@@ -81,22 +82,14 @@ def test_what_is_no_longer_published_is_shown_as_silent_with_its_age() -> None:
     assert "yaw" in view.text()
     view.now = SILENT_S + 1
     shown = view.text()
-    for words in ("silent", "no status for 4 s, then driven", "no attitude for 4 s"):
-        assert words in shown
-    for words in ("yaw", "12.5"):
-        assert words not in shown
+    assert all(words in shown for words in ("silent", "no status for 4 s, then driven", "no attitude for 4 s"))
+    assert not any(words in shown for words in ("yaw", "12.5"))
     view.receive(status__plant=status("plant", "driven"))
     assert "no telemetry for 4 s" in view.text()
 
 
-def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
-    spread = Percentiles(count=1, p50=12345, p99=67890, p999=1, max=1)
-    cause = "no command for 100 ms, the last one at tick 123456, from controller-1234-abcd: 0 V"
-    view = driven()
-    large = {"latency_us": spread, "cause": cause, "uptime_s": 86400 * 99, "skipped": 1234567}
-    view.receive(status__plant=status("plant", "tripped", **large))
-    shown = view.text(60)
-    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 60
-    for words in ("12345/67890", "1234567", "99 d", "tripped"):
-        assert words in shown
-    assert cause in " ".join(shown.split())
+@pytest.mark.parametrize(("days", "said"), [(13, True), (15, False)])
+def test_a_role_whose_certificate_expires_soon_says_so(days: int, said: bool) -> None:
+    until = datetime.now(UTC) + timedelta(days=days)
+    shown = View(status__plant=status("plant", "driven", certificate_until=until)).text()
+    assert (f"expires at {until:%Y-%m-%d}" in shown) == said

@@ -6,13 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from aeroloop.service.testing.process_group import free_rendezvous, start_command
-from tests.support.processes import LONGEST_S
+from tests.support.processes import LONGEST_S, sessions
 from tests.support.zenoh_network import eventually
 
 pytestmark = pytest.mark.processes
@@ -65,14 +64,3 @@ def test_nothing_outlives_the_process_that_started_it_even_if_that_is_killed(tmp
         process.kill()
         eventually("its end", lambda: child not in sessions())
     eventually("the end of all", lambda: process.pid not in sessions().values())
-
-
-def sessions() -> dict[int, int]:
-    """The session of each process by its id, but for those that have ended and that nothing has waited for."""
-    found = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):  # it has just ended
-            state, _, _, session, *_ = path.read_text().rsplit(")", 1)[1].split()
-            if state != "Z":
-                found[int(path.parent.name)] = int(session)
-    return found
