@@ -9,6 +9,8 @@ from collections.abc import Callable
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
+from aeroloop.service.cli.entry import end_unstarted
+
 if TYPE_CHECKING:
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
@@ -56,8 +58,7 @@ def _stop_on_signals() -> tuple[Event, Event]:
     def wait() -> None:
         signal.sigwait(signals)
         if not begun.is_set():
-            os.write(2, b"aeroloop: ended by a signal before it had started\n")
-            os._exit(0)
+            end_unstarted()
         stop.set()
 
     Thread(target=wait, daemon=True).start()

@@ -122,10 +122,20 @@ def install(folder: Path, source: Source) -> list[Path]:
 
 def next_steps(folder: Path | None, source: Source) -> list[str]:
     """Commands that remain after `install` into a folder (None: the units were printed) until the daemons run."""
-    install = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
+    hidden = [path for path in (Path(_executable()[0]), source.config.absolute()) if path.is_relative_to("/tmp")]  # noqa: S108
+    steps = [
+        f"# {path} is in /tmp, which units do not see (PrivateTmp=): move it, to /opt for example" for path in hidden
+    ]
+    if not source.config.exists():
+        steps.append(f"sudo mkdir -p {source.config.parent}")
+        steps.append(f"aeroloop show config | sudo tee {source.config} >/dev/null")
+    if folder is None:
+        command = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
+        steps.append(f"sudo {shlex.join(command)}")
+    elif folder.absolute() != SYSTEM_FOLDER:
+        steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
     names = " ".join(f"aeroloop-{name}" for name in units_of(source.settings))
-    steps = ["sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
-    return steps if folder is not None else [f"sudo {shlex.join(install)}", *steps]
+    return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
 
 
 def _executable() -> list[str]:

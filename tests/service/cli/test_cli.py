@@ -47,7 +47,7 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("log export a.mcap --format foo", "'foo' is not one of 'parquet', "),
         ("log review a.mcap --from 3 --to 2", "--from 3 is not before --to 2"),
         ("log review a.mcap --speed", "see `aeroloop log review --help`"),
-        ('demo --set plant.faults=["rate:x"]', "drop and garble, not "),
+        ('demo --set plant.faults=["rate:x"]', "drop, garble, not "),
     ],
 )
 def test_wrong_usage_and_configuration_exit_with_2_and_name_the_culprit(

@@ -132,3 +132,10 @@ def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, t
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "cannot listen on tcp/192.0.2.1:1" in done.stderr
+
+
+def test_what_a_unit_cannot_see_in_tmp_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "a.toml").touch()
+    hidden = tmp_path.is_relative_to("/tmp")  # noqa: S108
+    assert run(["host", "units", "--config", str(tmp_path / "a.toml")]) == 0
+    assert (f"{tmp_path / 'a.toml'} is in /tmp, which units do not see" in capfd.readouterr().out) == hidden
