@@ -116,6 +116,11 @@ def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing()
         genuine = controller.liveliness().declare_token("aeroloop/aero/alive/controller")
         eventually("it appears", lambda: seen == [True])
 
+        linked = stranger.liveliness().declare_token("aeroloop/aero/alive/mark")  # what ends before it is not seen
+        eventually("a token of the stranger", lambda: marks == [True])
+        linked.undeclare()
+        eventually("its end", lambda: marks == [True, False])
+        marks.clear()
         for n, name in enumerate(("controller", "controller-2", "plant", "**"), start=1):
             stranger.liveliness().declare_token(f"aeroloop/aero/alive/{name}").undeclare()
             stranger.liveliness().declare_token("aeroloop/aero/alive/mark").undeclare()  # after it, by the same link
