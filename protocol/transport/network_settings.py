@@ -182,8 +182,12 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     @property
     def mixed(self) -> bool:
         """Whether each kind of traffic has a transport of its own: between peers beyond loopback, if so set."""
-        beyond = any(Endpoint.parse(each).leaves_host for each in self.rendezvous)
-        return self.transport == "mixed" and self.mode == "peer" and beyond
+        return self.transport == "mixed" and self.between_hosts
+
+    @property
+    def between_hosts(self) -> bool:
+        """Whether it is a network of peers on several hosts."""
+        return self.mode == "peer" and any(Endpoint.parse(each).leaves_host for each in self.rendezvous)
 
 
 class Identity(NamedTuple):

@@ -29,7 +29,7 @@ _QUEUES: Final = ("control", "real_time", "interactive_high", "interactive_low",
 HEADER_BYTES: Final = 65_536  # more than Zenoh adds to a payload
 HANDSHAKE_MS: Final = 2000  # time-out of the handshake with a program that accepts a connection and sends nothing
 LEASE_MS: Final = 1000  # a silent peer is disconnected after this [ms]
-PATIENT_LEASE_MS: Final = 10_000  # where frames have a session of their own: at 20 % loss TCP is silent for seconds
+PATIENT_LEASE_MS: Final = 10_000  # between hosts: at 20 % loss TCP is silent for seconds
 LAST: Final = 0xFF  # rank of a session without a port of a rendezvous; Zenoh compares identifiers by their last byte
 RETRY_MS: Final = (50, 500)  # first and longest pause between two attempts to connect to an endpoint
 
@@ -79,7 +79,7 @@ def zenoh_config(
             # Late frames do no harm: the receiver refuses them by their tick.
             "link": {
                 "tx": {
-                    "lease": PATIENT_LEASE_MS if settings.mixed else LEASE_MS,
+                    "lease": PATIENT_LEASE_MS if settings.between_hosts else LEASE_MS,
                     "queue": {"size": dict.fromkeys((*_QUEUES, "background"), QUEUE)},
                 },
                 "rx": {"max_message_size": topics.POINTS_BYTES + HEADER_BYTES},  # of fragments: 1 GiB by default

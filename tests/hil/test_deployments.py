@@ -38,7 +38,7 @@ def cables_and_a_new_router(hosts: Deployment) -> None:
 
 
 def third_parties(hosts: Deployment) -> None:
-    """Over TCP alone, the harder case: frames share links and a lease of 1 s with all else."""
+    """Over TCP alone, the harder case: frames share links with all else."""
     hosts.cut_off("recorder")
     hosts.cut_off("operator")
     hosts.choke("recorder", 64, 4.0)  # until what is queued for it fills the queues
