@@ -33,10 +33,10 @@ from aeroloop.protocol.messages.models import (
     SessionRecord,
     Status,
 )
-from aeroloop.protocol.messages.operator import Answer, MessageError, Request
+from aeroloop.protocol.messages.operator import Answer, Mark, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
-from aeroloop.protocol.runtime.node import Node, RecorderWatch
+from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings
@@ -96,7 +96,8 @@ class ZenohNetwork(PlantNetwork):
         role.serve("record", SessionRecord, self._keep_record)
         role.serve("show", Request, lambda _: self._show)
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
-        role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
+        role.serve("stop", Request, lambda _: self._once_kept(self._stop))
+        role.serve("mark", Mark, lambda mark: lambda: self._mark(mark.text))
         if not self._loop.lockstep:
             role.datagrams.listen()
         self._others = role.zenoh.declare_subscriber(
@@ -264,9 +265,18 @@ class ZenohNetwork(PlantNetwork):
             return Answer(done=True, text=f"{vehicle} is armed: the next controller to claim it may drive it")
         return Answer(done=False, text=f"{vehicle} is held by {self._endpoint.holder}, so there is nothing to arm")
 
-    def _stop(self, by: str | None) -> Answer:
+    def _stop(self) -> Answer:
+        by = ASKED_BY.get()
         self._endpoint.stop(reason=f"stopped by an operator ({by})" if by else "stopped by an operator")
         return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
+
+    def _mark(self, text: str) -> Answer:
+        endpoint = self._endpoint
+        tick = endpoint.event_tick
+        self._role.event("marked", text, endpoint.session, tick)
+        if not self._recorder.present:
+            return Answer(done=False, text="no recorder runs: the mark is in a log only if one starts within a minute")
+        return Answer(done=True, text=f"marked{'' if tick is None else f' at tick {tick}'}: {text}")
 
     def _once_kept(self, change: Callable[[], Answer]) -> Callable[[], Answer]:
         """Queue a change of the latch, and answer when it is on disk. Waits in the topic's thread, not in the loop."""

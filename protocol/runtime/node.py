@@ -15,6 +15,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from contextvars import ContextVar, copy_context
+from functools import partial
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -40,6 +42,8 @@ AT_ONCE: Final = 8
 """Actions that run between two ticks; the others wait."""
 WAITING: Final = 64
 """Queries that may wait to be answered between ticks; more are refused."""
+ASKER_LENGTH: Final = 100
+"""Most characters of an operator's name."""
 LONG_S: Final = 10.0
 """Least time between two requests of a topic that are too long to be parsed in a fraction of a tick [s]."""
 _RECENT_S: Final = 10.0
@@ -70,8 +74,23 @@ def log_event(event: Event, vehicle: str | None) -> None:
     log.log(level, event.text, extra={"event": event.kind, "vehicle": vehicle, **fields})
 
 
+ASKED_BY: Final = ContextVar("asked by", default="")
+"""The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
+
+
+def _asker(query: zenoh.Query) -> str:
+    """The name in a query's attachment; empty if there is none, or none to print."""
+    with suppress(UnicodeDecodeError):
+        name = query.attachment.to_bytes().decode() if query.attachment else ""
+        return name if len(name) <= ASKER_LENGTH and name.isprintable() else ""
+    return ""
+
+
 class Requests:
-    """Requests received from the network, answered between two ticks: when the owner of the loop calls `take_inbox`."""
+    """Requests received from the network, answered between two ticks: when the owner of the loop calls `take_inbox`.
+
+    What an operator's request causes at once is done in its context: `ASKED_BY` has the operator's name.
+    """
 
     def __init__(self, session: zenoh.Session, vehicle: str, clock: Clock) -> None:
         self._session = session
@@ -106,6 +125,7 @@ class Requests:
             if not named or len(payload) > topics.TOPICS[topic].request:  # wildcards pass Zenoh's filter of lengths
                 query.drop()
                 return
+            asked = ASKED_BY.set(_asker(query))
             try:
                 if len(self._inbox) >= WAITING:
                     raise MessageError(f"{WAITING} requests wait already; ask again")
@@ -113,7 +133,9 @@ class Requests:
             except AeroloopError as error:
                 reply(query, Answer(done=False, text=str(error)))
             else:
-                self._inbox.append(lambda: act(query, action))
+                self.enqueue(lambda: act(query, action))
+            finally:
+                ASKED_BY.reset(asked)
 
         self._session.declare_queryable(key, received, complete=True)
 
@@ -128,7 +150,7 @@ class Requests:
 
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
-        self._inbox.append(action)
+        self._inbox.append(partial(copy_context().run, action))
 
     def take_inbox(self) -> bool:
         """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
@@ -289,6 +311,8 @@ class Node:
 
     def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Publish and log an event, with the session's tick if there is one."""
+        by = ASKED_BY.get()
+        text = f"{text} (by {by})" if by and by not in text else text
         event = Event(role=self.role, kind=kind, text=text, session=session, tick=tick)
         log_event(event, self.vehicle)
         self.publish("event", event)

@@ -112,6 +112,21 @@ def stop(
 
 
 @group.command()
+def mark(
+    text: Annotated[str, typer.Argument(help="A line to find the instant by.")],
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Put a mark into the log, which `log review` lists and `log export --around` finds."""
+    from aeroloop.protocol.messages.operator import Mark
+
+    target = target_of(config, overrides)
+    with checked(Mark):
+        message = Mark(text=text)
+    _send(target, "mark", message)
+
+
+@group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle, for another one. It holds until `op arm`."""
     _send(target_of(config, overrides), "stand_down")

@@ -23,7 +23,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.host import listener
-from aeroloop.protocol.transport.certificate import refusal
+from aeroloop.protocol.runtime.node import ASKER_LENGTH
+from aeroloop.protocol.transport.certificate import Certificate, refusal
 from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
@@ -94,7 +95,7 @@ def only_vehicle(network: NetworkSettings) -> str | None:
 
 
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Send a request to a vehicle's plant (`arm`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
+    """Send a request to a vehicle's plant (`arm`, `mark`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 
     `arm` also recalls controllers that are holding or faulted.
 
@@ -108,16 +109,16 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
-            answers = _answers(here.session, topic, vehicle, message)
+            answers = _answers(here, topic, vehicle, message)
             time.sleep(POLL_S)
         if not answers:
-            role = {"arm": "plant", "inject": "emulator"}.get(topic, "controller")
+            role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
             raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
         done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
         if not done:
             raise OperatorError("; ".join(answer.text for answer in answers))
         if topic == "arm":
-            done += [answer.text for answer in _answers(here.session, "recall", vehicle, Request()) if answer.done]
+            done += [answer.text for answer in _answers(here, "recall", vehicle, Request()) if answer.done]
         return "; ".join(done)
 
 
@@ -163,7 +164,8 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
                     here.session.get(
                         topics.key("stop", address.vehicle),
                         received,
-                        payload=Request(by=_user()).encode(),
+                        payload=Request().encode(),
+                        attachment=_user(here.certificate),
                         timeout=wait_s,
                         target=zenoh.QueryTarget.ALL,
                         consolidation=zenoh.ConsolidationMode.NONE,
@@ -181,13 +183,14 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     return Stopped([text for texts in answers.values() for text in texts], failures)
 
 
-def _user() -> str:
-    """This user, for people to read."""
+def _user(certificate: Certificate | None) -> str:
+    """This user and host, and the name in the certificate, for people to read."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container's user without a name
         user = f"uid {os.getuid()}"
-    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:64]
+    name = f"{user}@{socket.gethostname()}" + (f", certificate of {certificate.name}" if certificate else "")
+    return "".join(filter(str.isprintable, name))[:ASKER_LENGTH]
 
 
 def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str]:
@@ -198,21 +201,25 @@ def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str
     return sorted(name for name in controlled if name not in answered)
 
 
-def _get(session: zenoh.Session, key: str, payload: bytes | None, timeout_s: float) -> Iterable[zenoh.Reply]:
+def _get(
+    session: zenoh.Session, key: str, payload: bytes | None, timeout_s: float, attachment: str | None = None
+) -> Iterable[zenoh.Reply]:
     """All replies to a query; those of several roles to one key are not merged. A token's key if `payload` is None."""
     if payload is None:
         return session.liveliness().get(key, timeout=timeout_s)
     return session.get(
         key,
         payload=payload,
+        attachment=attachment,
         timeout=timeout_s,
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
     )
 
 
-def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
-    replies = _get(session, topics.key(topic, vehicle), message.encode(), ANSWER_S)
+def _answers(here: CommandSession, topic: str, vehicle: str, message: Message) -> list[Answer]:
+    key, asker = topics.key(topic, vehicle), _user(here.certificate)
+    replies = _get(here.session, key, message.encode(), ANSWER_S, asker)
     return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 

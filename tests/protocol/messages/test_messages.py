@@ -19,10 +19,10 @@ from aeroloop.protocol.messages.operator import (
     Gains,
     Hold,
     Inject,
+    Mark,
     Message,
     MessageError,
     Points,
-    Request,
     Setpoint,
     Sinusoid,
     Stream,
@@ -113,9 +113,9 @@ def test_a_status_of_another_version_is_read_as_far_as_it_is_known() -> None:
 
 
 def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
-    for payload in (b'{"\\u001b[2J\\n": 0}', b'{"by": "\\u001b[2J\\n"}', b'{"by": {"\\u001b[2J\\n": 0}}'):
+    for payload in (b'{"\\u001b[2J\\n": 0}', b'{"text": "\\u001b[2J\\n"}', b'{"text": {"\\u001b[2J\\n": 0}}'):
         with pytest.raises(MessageError) as refused:
-            Request.decode(payload)
+            Mark.decode(payload)
         assert str(refused.value).isprintable()
     with pytest.raises(MessageError, match=r"reference: tag ' \[2J ' found") as refused:
         Track.decode(b'{"reference": {"kind": "\\u001b[2J\\n"}}')
@@ -156,8 +156,8 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
         (Sinusoid, {"frequency": (0.0, inf, 0.0)}, "frequency: Input should be less than or equal to 100"),
         (Stream, {"timeout_s": 0.0}, "timeout_s: Input should be greater than 0"),
         (Track, {"reference": Hold(), "within_s": 0.0}, "within_s: Input should be greater than or equal to 0.02"),
-        (Request, {"by": "a" * 65}, "by: String should have at most 64 characters"),
-        (Request, {"by": "\x1b[2J"}, "by: every character must be printable"),
+        (Mark, {"text": "a" * 201}, "text: String should have at most 200 characters"),
+        (Mark, {"text": "\x1b[2J"}, "text: every character must be printable"),
     ],
 )
 def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
