@@ -56,6 +56,7 @@ class EmulatorNetwork(ZenohNetwork):
     def _inject(self, request: Inject) -> Callable[[], Answer]:
         def inject() -> Answer:
             done = self._driver.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
+            self.follow_session()  # here, so that its events name the operator
             return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
         return inject
