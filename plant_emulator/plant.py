@@ -26,7 +26,6 @@ T = TypeVar("T")
 EMULATED: Final = ("aero", "rigid_body")
 """Kinds that are not a class but a body of the emulated plant."""
 
-GROUP: Final = "aeroloop.plants"
 
 BUILT_IN: Final = {
     **dict.fromkeys(EMULATED, "aeroloop.plant_emulator.model.emulated:EmulatedPlant"),
@@ -124,7 +123,7 @@ class Plant(ABC):
 
 def class_of(kind: str) -> type[Plant]:
     """The class that `plant.kind` names. Raises PluginError."""
-    return plugins.find("plant.kind", kind, GROUP, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
+    return plugins.find("plant.kind", kind, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
 
 
 def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: float) -> OwnPlant:

@@ -64,7 +64,7 @@ class PlantSettings(BaseModel, extra="forbid"):
         default="aero",
         min_length=1,
         description="which plant: the emulated bodies aero and rigid_body, on which rotor, friction, wind and sensors "
-        "act; mujoco or fmu; an entry point of aeroloop.plants; or package.module:Class of your own. Faults, limits, "
+        "act; mujoco or fmu; or package.module:Class of your own. Faults, limits, "
         "watchdog and voltage_limit act on any",
     )
     own: dict[str, Any] = Field(

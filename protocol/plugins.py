@@ -1,7 +1,7 @@
 """Plug-ins: classes that the configuration names, ours by a short name, a user's as `package.module:Class`.
 
-A short name is one of ours or an entry point of the group, such as `aeroloop.laws`. A module is looked for where Python
-looks, and in the current folder. Importing it runs its code, so a class is only looked up by a process that uses it.
+A module is looked for where Python looks, and in the current folder. Importing it runs its code, so a class is only
+looked up by a process that uses it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping
 from hashlib import sha256
 from importlib import import_module
-from importlib.metadata import entry_points, packages_distributions, version
+from importlib.metadata import packages_distributions, version
 from inspect import getsourcefile, getsourcelines
 from pathlib import Path
 from sysconfig import get_path
@@ -29,23 +29,16 @@ class PluginError(AeroloopError):
     """A class that is not there, is of another kind, or failed; one line with its name."""
 
 
-def find(key: str, kind: str, group: str, built_in: Mapping[str, str], base: type[T]) -> type[T]:
-    """The class, derived from `base`, that `kind` names: one of ours, an entry point of `group`, or `module:Class`.
+def find(key: str, kind: str, built_in: Mapping[str, str], base: type[T]) -> type[T]:
+    """The class, derived from `base`, that `kind` names: one of ours, or `module:Class`.
 
     `key` is the configuration's key that holds it, such as `law.kind`, for messages. Raises PluginError if there is no
     such class, its module fails, or it does not derive from `base`.
     """
     given = f"{key} = {kind!r}"
-    target = built_in.get(kind, kind)
-    if ":" not in target:
-        installed = {point.name: point.value for point in entry_points(group=group)}
-        if kind not in installed:
-            known = ", ".join(sorted({*built_in, *installed}))
-            raise PluginError(f"{given} is not known: it is one of {known}, or package.module:Class")
-        target = installed[kind]
-    module_name, _, name = target.partition(":")
+    module_name, _, name = built_in.get(kind, kind).partition(":")
     if not (module_name and name):
-        raise PluginError(f"{given} does not name a class: write package.module:Class")
+        raise PluginError(f"{given} is not known: it is one of {', '.join(sorted(built_in))}, or package.module:Class")
     if str(Path.cwd()) not in sys.path and "" not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:
@@ -76,9 +69,8 @@ def source_of(plugin: type[Any]) -> str:
 def exception_line(error: BaseException, called: Any = None) -> str:
     """An exception from a user's code in one line: class, text, and where it is from.
 
-    That is the innermost line outside of this package and of installed ones, such as CasADi, which would raise it for
-    the user's mistake. Where there is none, as where a result is refused, it is the first line of `called`: the user's
-    function or class.
+    That is the innermost line outside of this package and of installed ones, such as CasADi; where there is none, as
+    where a result is refused, the first line of `called`, the user's function or class.
     """
     text = " ".join(str(error).split())
     line = f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -94,8 +94,8 @@ class Settings(Target):
         patience_s, name = max(
             (self.plant.watchdog_s, "plant.watchdog_s"), (self.controller.stale_s, "controller.stale_s")
         )
-        needed_ns = 2 * round(patience_s * 1e9)
-        if self.loop.lockstep or wire.freshness_ns(period_ns) >= needed_ns:
+        needed_ns, counted_ns = 2 * round(patience_s * 1e9), period_ns << wire.counter_bits
+        if self.loop.lockstep or counted_ns >= needed_ns:
             return self
         if self.plant.via == "can" and counter_fills_frame(self.can, wire):
             return self
@@ -106,7 +106,7 @@ class Settings(Target):
             else f"even {MAX_COUNTER_BITS} bits are too few; shorten {name}, or lower loop.rate_hz"
         )
         raise ValueError(
-            f"wire.counter_bits = {wire.counter_bits} counts {wire.freshness_ns(period_ns) * 1e-6:g} ms, less than "
+            f"wire.counter_bits = {wire.counter_bits} counts {counted_ns * 1e-6:g} ms, less than "
             f"twice {name}, which is {patience_s * 1e3:g} ms: {way}"
         )
 

@@ -111,7 +111,7 @@ def figures(
         command_changes_per_s=changes_per_s,
         measurement=_stream(len(k) - unsent[0], wire.measurement, duration),
         command=_stream(len(answered) - unsent[1], wire.command, duration),
-        skipped_ticks=ticks - len(answered) if len(k) else None,
+        skipped_ticks=int(np.ptp(np.append(k, answered))) + 1 - len(answered) if len(k) else None,
         latency_us=latency,
         log=log,
         trips=list(trips),

@@ -158,7 +158,6 @@ class ZenohNetwork(PlantNetwork):
         endpoint, role = self._endpoint, self._role
         now = time.monotonic()
         _, tick, then = self._published
-        self._latency.turn_when_due()
         role.status(
             Status(
                 role=role.role,
@@ -178,7 +177,7 @@ class ZenohNetwork(PlantNetwork):
                 stale=endpoint.stale,
                 saturated=endpoint.saturated,
                 latency_us=self._latency.total.summary(),
-                recent_latency_us=self._latency.recent().summary(),
+                recent_latency_us=self._latency.recent(),
                 timing=self.timing.report() if self.timing else None,
                 notes=self.notes,
                 lacks_recorder="gone" if self._recorder.gone else None,

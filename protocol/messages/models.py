@@ -15,8 +15,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 
 PROTOCOL_VERSION: Final = 2
 
-STATUS_VALUES: Final = 2048
-"""Values of a status with 128 faults, twice."""
+STATUS_VALUES: Final = 2048  # values of a status with 128 faults, twice
 
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault", "marked"
@@ -37,8 +36,7 @@ SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"),
 """One chunk of a key, and not the first chunk of a topic's key."""
 TokenName = Annotated[str, StringConstraints(pattern=r"^[^/*$#?]{1,64}$")]
 """One chunk of a liveliness token's key, without wildcards."""
-MAX_SIGNALS: Final = 16
-"""So many fit into the 2 KiB of a true state."""
+MAX_SIGNALS: Final = 16  # so many fit into the 2 KiB of a true state
 Signals = Annotated[
     dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")], FiniteFloat | None],
     Field(max_length=MAX_SIGNALS),

@@ -30,8 +30,7 @@ from aeroloop.protocol.wording import problem
 MAX_POINTS: Final = 10_000
 MAX_WITHIN_S: Final = 600.0
 
-MAX_VALUES: Final = 256
-"""Values of an ordinary message: a request that injects 64 faults has 65."""
+MAX_VALUES: Final = 256  # values of an ordinary message: a request that injects 64 faults has 65
 REFERENCE_VALUES: Final = 4 * MAX_POINTS + MAX_VALUES
 """Values of what may hold a reference of `MAX_POINTS` points, which takes some 10 ms to parse."""
 
@@ -68,8 +67,7 @@ class Message(BaseModel):
             raise MessageError(f"not a {cls.__name__}: {problem(error, cls)}") from None
 
 
-Angles = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-"""Roll, pitch, yaw [deg]."""
+Angles = tuple[FiniteFloat, FiniteFloat, FiniteFloat]  # roll, pitch, yaw [deg]
 Frequency = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -143,8 +141,7 @@ class Setpoint(Message):
     attitude: Angles = Field(description="roll, pitch, yaw [deg]")
 
 
-MAX_GAINS: Final = 32
-"""The most gains of a law, and numbers of a gain."""
+MAX_GAINS: Final = 32  # the most gains of a law, and numbers of a gain
 
 
 Gain = Annotated[

@@ -1,8 +1,7 @@
 """Topics: the one table of what crosses the network, with keys, roles, models and sizes.
 
-Every key starts with `aeroloop/<vehicle>/`. Frames travel under the session's own keys, so that frames of another
-controller, or of another wire spec, cannot arrive. Services and the recorder look topics up here, and a network with
-certificates takes its access rules from here (transport/zenoh_config.py).
+Frames travel under the session's own keys, so that frames of another controller, or of another wire spec, cannot
+arrive. A network with certificates takes its access rules from here (transport/zenoh_config.py).
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ _READERS: Final[_Roles] = ("operator", "observer", "recorder")
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 QUERIES_PER_S: Final = 50.0
-"""Most queries a second on a topic that a process takes from one link; what comes sooner after another is dropped. One
-rate for all topics: Zenoh applies any of the rules that a wildcard query meets."""
+"""Most queries a second that a process takes on a topic from one link. Zenoh applies any rule that a wildcard meets."""
 
 FRAME_BYTES: Final = 256  # more than the longest frame: six elements of 64 bits and a counter
 SAMPLE_BYTES: Final = 2048  # one tick's telemetry or truth
@@ -108,8 +106,7 @@ TOPICS: Final = {
     )
 }
 
-RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
-"""Topics published from a cache."""
+RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)  # topics published from a cache
 
 _Actions = tuple[Action, ...]
 _CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer"), ("subscribe", "query")
@@ -149,7 +146,7 @@ def cache_key(key: str) -> str:
 
 
 def cached_key(key: str) -> str:
-    """The key of the topic whose cache is queried on a key."""
+    """Inverse of `cache_key`."""
     return key.removesuffix(_CACHE)
 
 

@@ -1,13 +1,8 @@
 """Trace: what each end did, tick by tick, published in columnar batches that numpy reads.
 
-An end adds a row at every tick of a session. A batch has the columns of some rows, which compress to two thirds of the
-rows' size:
-
-    header (112 bytes) · columns, one after another · tail (JSON)
-
-`SPEC.md`, section 10, defines every byte, with golden vectors. The writer is sans-I/O: the owner passes times and
-publishes what `take` returns. Times in a batch are whole microseconds after the header's `monotonic_ns`, on the end's
-own monotonic clock; the clocks of two hosts are never compared.
+A batch is a header, the columns of some rows one after another, and a tail in JSON; `SPEC.md`, section 10, defines
+every byte. Its times are whole microseconds after the header's `monotonic_ns`, on the end's own monotonic clock; the
+clocks of two hosts are never compared.
 """
 
 from __future__ import annotations
@@ -32,19 +27,15 @@ Columns = dict[str, npt.NDArray[Any]]
 End = Literal["controller", "plant"]
 ENDS: Final[tuple[End, ...]] = ("controller", "plant")
 
-TRACE_NS: Final = 100_000_000
-"""A batch is published this long after its first row [ns]: a process that is killed loses no more."""
+TRACE_NS: Final = 100_000_000  # a batch is published so long after its first row: a killed process loses no more
 MAX_ROWS: Final = 256
-"""Rows of a batch at the most."""
 STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
 """Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so they compress
 to a fifth. The first row's step is from 0."""
 NEVER: Final = 0xFFFF_FFFF
 """In a column of times or of session ticks: none. Times wrap after 71 minutes, longer than any batch: `due` is checked
 after every row."""
-RECORD_S: Final = 1.0
-"""How often a batch has the session's record [s]."""
-
+RECORD_S: Final = 1.0  # how often a batch has the session's record
 _RECORD_BYTES_PER_S: Final = 16_384  # a longer record, of many points, is in as many batches as take this much
 _BATCHES_BEYOND: Final = 1.25  # those of sessions that begin and end, and of operations between them
 _FASTEST_HZ: Final = 10_000.0  # bound on the tick rate in lockstep, where the grid's rate does not apply
@@ -145,29 +136,25 @@ class PlantRow(NamedTuple):
     voltages: Sequence[float]  # in force from this tick's beginning to the next command [V]
 
 
-_COLUMNS: Final[dict[End, dict[str, str]]] = {
-    "controller": {"tick": "<u4", "received_as": "u1", "sent_as": "u1", "received": "<u4", "sent": "<u4"},
-    "plant": {
-        "tick": "<u8",
-        "session_tick": "<u4",
-        "sent_as": "u1",
-        "received_as": "u1",
-        "outcome": "u1",
-        "trip": "u1",
-        "answered": "<u4",
-        "sent": "<u4",
-        "received": "<u4",
-    },
-}
+_COLUMNS: Final[dict[End, list[tuple[str, str]]]] = {
+    "controller": [("tick", "<u4"), ("received_as", "u1"), ("sent_as", "u1"), ("received", "<u4"), ("sent", "<u4")],
+    "plant": [
+        ("tick", "<u8"), ("session_tick", "<u4"), ("sent_as", "u1"), ("received_as", "u1"), ("outcome", "u1"),
+        ("trip", "u1"), ("answered", "<u4"), ("sent", "<u4"), ("received", "<u4"),
+    ],
+}  # fmt: skip
 """Types of a row's columns before the frames and, at the plant, the voltages."""
+_WIDE: Final = dict.fromkeys(("answered", "sent", "received"), "<i8")
+"""Types of columns as they are added: −1 for none, and times in ns."""
 
 
 @lru_cache(maxsize=16)
-def row_dtype(end: End, measurement: int, command: int, actuators: int) -> np.dtype[np.void]:
-    """Fields of a row, in the order of the columns. Sizes of the frames in bytes."""
+def row_dtype(end: End, actuators: int, measurement: int, command: int, *, added: bool = False) -> np.dtype[np.void]:
+    """Fields of a row, in the order of the columns; if `added`, as it is added. Sizes of the frames in bytes."""
+    columns = [(name, _WIDE.get(name, kind) if added else kind) for name, kind in _COLUMNS[end]]
     frames = [("measurement", f"V{measurement}"), ("command", f"V{command}")]
     voltages = [("voltages", "<f8", (actuators,))] if end == "plant" else []
-    return np.dtype([*_COLUMNS[end].items(), *frames, *voltages])
+    return np.dtype([*columns, *frames, *voltages])
 
 
 class Header(NamedTuple):
@@ -189,7 +176,7 @@ class Header(NamedTuple):
     @property
     def row_dtype(self) -> np.dtype[np.void]:
         """Fields of the rows."""
-        return row_dtype(self.end, self.measurement_bytes, self.command_bytes, self.actuators)
+        return row_dtype(self.end, self.actuators, self.measurement_bytes, self.command_bytes)
 
 
 class Batch(NamedTuple):
@@ -255,8 +242,7 @@ class TraceWriter:
         self.record = b""
         self._in_force: list[Change] = []
         self._record_due_ns = 0
-        self._shape = wire.actuators, wire.measurement.size, wire.command.size
-        self._dtype = row_dtype(end, wire.measurement.size, wire.command.size, wire.actuators)
+        self._wire = wire
         self._rows: list[ControllerRow | PlantRow] = []
         self._run = run
         self._published = 0
@@ -278,15 +264,7 @@ class TraceWriter:
         if not self._rows:
             first_ns = row.received_ns if isinstance(row, ControllerRow) else row.sent_ns or row.received_ns
             self._base_ns = first_ns - _MARGIN_NS
-        received, sent = self._us(row.received_ns), self._us(row.sent_ns)
-        if isinstance(row, ControllerRow):
-            self._rows.append(row._replace(received_ns=received, sent_ns=sent))
-        else:
-            self._rows.append(row._replace(received_ns=received, sent_ns=sent, answered=row.answered & NEVER))
-
-    def _us(self, ns: int) -> int:
-        """A time as a batch has it: whole microseconds after its base."""
-        return (ns - self._base_ns) // 1000 & NEVER if ns else NEVER
+        self._rows.append(row)
 
     def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:
         """Pack all that is buffered into a batch, and clear the buffer. If `final`, the session's rows end here.
@@ -300,29 +278,25 @@ class TraceWriter:
         if record := self._due_record(now_ns):
             parts.append(b'"record":' + record)
         text = b"{" + b",".join(parts) + b"}" if parts else b""
-        header = _HEADER.pack(
-            PROTOCOL_VERSION,
-            ENDS.index(self.end),
-            _FINAL if final else 0,
-            *self._shape,
-            len(rows),
-            len(text),
-            self._run,
-            self._published,
-            base_ns,
-            wall_ns - (now_ns - base_ns),
-            self.session.encode("ascii"),
-        )
-        records = np.array(rows, self._dtype)
+        wire = self._wire
+        sizes = wire.actuators, wire.measurement.size, wire.command.size
+        counts = len(rows), len(text), self._run, self._published
+        session = self.session.encode("ascii")
+        flags, wall_base_ns = _FINAL if final else 0, wall_ns - (now_ns - base_ns)
+        head = PROTOCOL_VERSION, ENDS.index(self.end), flags, *sizes, *counts, base_ns, wall_base_ns, session
+        added, kinds = np.array(rows, row_dtype(self.end, *sizes, added=True)), row_dtype(self.end, *sizes)
         columns = []
-        for name in self._dtype.names or ():
-            column = records[name]
-            steps = np.diff(column, prepend=column.dtype.type(0)) if name in STEPS else column
-            columns.append(steps.tobytes())
+        for name in kinds.names or ():
+            column = added[name]
+            if name in ("received", "sent"):
+                column = np.where(column, (column - base_ns) // 1000, NEVER)
+            if name in STEPS:
+                column = np.diff(column.astype(kinds[name]), prepend=kinds[name].type(0))
+            columns.append(column.tobytes())
         self._published += len(rows)
         self._rows = []
         self.state, self.changes, self.operations = None, [], []
-        return b"".join([header, *columns, text])
+        return b"".join([_HEADER.pack(*head), *columns, text])
 
     def _due_record(self, now_ns: int) -> bytes:
         """Bring the controller's record up to date, and return the record if it is due."""

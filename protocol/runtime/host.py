@@ -13,13 +13,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aeroloop.protocol.transport.endpoint import STREAMS, Endpoint
+from aeroloop.protocol.transport.network_settings import STREAMS, Endpoint
 
 PACKAGES: Final = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
 """Packages that compute, transport or store the figures in a log."""
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
-_PR_SET_NAME: Final = 15
+_PR_SET_NAME: Final = 15  # prctl(2)
 _LISTENS: Final = "0A"  # state of a socket in /proc/net/tcp
 _ROLES: Final = ("plant", "controller", "recorder", "router")
 

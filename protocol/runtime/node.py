@@ -1,9 +1,4 @@
-"""Node: a process's presence on the network, with description, status, events, requests and liveliness.
-
-A Node joins the network and answers queries for its description and status. Its owner declares the liveliness token
-once ready, and publishes through it. It is a context manager: leaving it closes the Zenoh session, without which a
-Python process would not end.
-"""
+"""Node: a process's presence on the network, with description, status, events, requests and liveliness."""
 
 from __future__ import annotations
 
@@ -20,7 +15,6 @@ from functools import partial
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
-from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
@@ -32,30 +26,22 @@ from aeroloop.protocol.runtime.host import host_facts, name_process, versions
 from aeroloop.protocol.runtime.timing import Clock, Throttle
 from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
 from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
-from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
+from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, protected
 
 M = TypeVar("M", bound=Message)
-Action = Callable[[], object]
-"""A function to run between two ticks."""
+Action = Callable[[], object]  # a function to run between two ticks
 
-AT_ONCE: Final = 8
-"""Actions that run between two ticks; the others wait."""
-WAITING: Final = 64
-"""Queries that may wait to be answered between ticks; more are refused."""
-ASKER_LENGTH: Final = 100
-"""Most characters of an operator's name."""
-LONG_S: Final = 10.0
-"""Least time between two requests of a topic that are too long to be parsed in a fraction of a tick [s]."""
+AT_ONCE: Final = 8  # actions that run between two ticks; the others wait
+WAITING: Final = 64  # queries that may wait to be answered between ticks; more are refused
+LONG_S: Final = 10.0  # least time between two requests of a topic that take longer than a fraction of a tick to parse
+ASKER_LENGTH: Final = 100  # most characters of an operator's name
+ASKED_BY: Final = ContextVar("asked by", default="")
+"""The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
 _RECENT_S: Final = 10.0
-_SELDOM_PER_S: Final = 8.0
-"""Cached messages per second of a topic that was not declared beforehand: statuses, events."""
+_SELDOM_PER_S: Final = 8.0  # cached messages of a topic that was not declared beforehand: statuses, events
 _GRAVE: Final = ("tripped", "lost", "fault", "refused")
 
 log: Final = logging.getLogger("aeroloop")
-
-
-class OccupiedError(AeroloopError):
-    """The vehicle has a plant already; one line that names it."""
 
 
 def notify_systemd(state: str) -> None:
@@ -74,98 +60,21 @@ def log_event(event: Event, vehicle: str | None) -> None:
     log.log(level, event.text, extra={"event": event.kind, "vehicle": vehicle, **fields})
 
 
-ASKED_BY: Final = ContextVar("asked by", default="")
-"""The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
-
-
 def _asker(query: zenoh.Query) -> str:
-    """The name in a query's attachment; empty if there is none, or none to print."""
+    """The operator in a query's attachment; empty if it has none, or none to print."""
     with suppress(UnicodeDecodeError):
         name = query.attachment.to_bytes().decode() if query.attachment else ""
         return name if len(name) <= ASKER_LENGTH and name.isprintable() else ""
     return ""
 
 
-class Requests:
-    """Requests received from the network, answered between two ticks: when the owner of the loop calls `take_inbox`.
-
-    What an operator's request causes at once is done in its context: `ASKED_BY` has the operator's name.
-    """
-
-    def __init__(self, session: zenoh.Session, vehicle: str, clock: Clock) -> None:
-        self._session = session
-        self._vehicle = vehicle
-        self._inbox: deque[Action] = deque()
-        self._long = Throttle(LONG_S, clock)
-
-    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
-        """Answer a topic's queries between ticks.
-
-        A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
-        is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
-        `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
-        returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
-        """
-        key = topics.key(topic, self._vehicle)
-        name = key.rpartition("/")[2]
-
-        def reply(query: zenoh.Query, answer: Message) -> None:
-            query.reply(key, answer.encode())  # not the query's key, which may name many vehicles
-            query.drop()
-
-        def act(query: zenoh.Query, action: Callable[[], Message]) -> None:
-            try:
-                reply(query, action())
-            except AeroloopError as error:
-                reply(query, Answer(done=False, text=str(error)))
-
-        def received(query: zenoh.Query) -> None:
-            payload = query.payload.to_bytes() if query.payload else b"{}"
-            named = str(query.key_expr).endswith(f"/{name}")  # `**`, by which tools list a network, names no verb
-            if not named or len(payload) > topics.TOPICS[topic].request:  # wildcards pass Zenoh's filter of lengths
-                query.drop()
-                return
-            asked = ASKED_BY.set(_asker(query))
-            try:
-                if len(self._inbox) >= WAITING:
-                    raise MessageError(f"{WAITING} requests wait already; ask again")
-                action = prepare(self._read(topic, model, payload))
-            except AeroloopError as error:
-                reply(query, Answer(done=False, text=str(error)))
-            else:
-                self.enqueue(lambda: act(query, action))
-            finally:
-                ASKED_BY.reset(asked)
-
-        self._session.declare_queryable(key, received, complete=True)
-
-    def _read(self, topic: str, model: type[M], payload: bytes) -> M:
-        """Read a request. Raises MessageError."""
-        short = len(payload) <= topics.MESSAGE_BYTES and payload.count(b",") <= MAX_VALUES
-        if short or topics.TOPICS[topic].request <= topics.MESSAGE_BYTES:
-            return model.decode(payload)
-        if self._long.let_pass(topic) is None:
-            raise MessageError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
-        return model.decode(payload)
-
-    def enqueue(self, action: Action) -> None:
-        """Queue an action to run between two ticks; may be called from any thread."""
-        self._inbox.append(partial(copy_context().run, action))
-
-    def take_inbox(self) -> bool:
-        """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
-        waiting = min(AT_ONCE, len(self._inbox))
-        for _ in range(waiting):
-            self._inbox.popleft()()
-        return waiting > 0
-
-
 class Node:
-    """A process's presence on the network.
+    """A process's presence on the network: answers for its description and status, and publishes what its owner says.
 
     `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
     its effective configuration, for the description. `name` is its liveliness token's; the role's if None. Its owner
-    runs until `stop` is set, by `clock`. Errors are those of `join`, and OccupiedError for a vehicle's second plant.
+    runs until `stop` is set, by `clock`. Leaving it closes the Zenoh session, without which a Python process would not
+    end. Errors are those of `join`, and NetworkError for a vehicle's second plant.
     """
 
     def __init__(
@@ -193,8 +102,8 @@ class Node:
         self.datagrams = FrameSession(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._publishers: dict[str, CachedPublisher] = {}
-        requests = Requests(self.zenoh, vehicle, clock)
-        self.serve, self.enqueue, self.take_inbox = requests.serve, requests.enqueue, requests.take_inbox
+        self._inbox: deque[Action] = deque()
+        self._long = Throttle(LONG_S, clock)
         self._last: tuple[float, Status] | None = None  # status, and when it was taken; another thread reads it
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
         self._throttle = Throttle(clock=clock)
@@ -216,6 +125,69 @@ class Node:
         """Seconds since the node joined."""
         return self.clock.monotonic() - self._started
 
+    # ── requests ──
+
+    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
+        """Answer a topic's queries between ticks: when the owner of the loop calls `take_inbox`.
+
+        A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
+        is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
+        `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
+        returns runs between ticks and returns the reply. An AeroloopError from either is the reply. Both run in the
+        context of the operator in the query's attachment, `ASKED_BY`.
+        """
+        key = topics.key(topic, self.vehicle)
+        name = key.rpartition("/")[2]
+
+        def reply(query: zenoh.Query, work: Callable[[], Message | None]) -> None:
+            try:
+                answer = work()
+            except AeroloopError as error:
+                answer = Answer(done=False, text=str(error))
+            if answer is not None:
+                query.reply(key, answer.encode())  # not the query's key, which may name many vehicles
+                query.drop()
+
+        def received(query: zenoh.Query) -> None:
+            payload = query.payload.to_bytes() if query.payload else b"{}"
+            named = str(query.key_expr).endswith(f"/{name}")  # `**`, by which tools list a network, names no verb
+            if not named or len(payload) > topics.TOPICS[topic].request:  # wildcards pass Zenoh's filter of lengths
+                query.drop()
+                return
+
+            def accept() -> None:
+                if len(self._inbox) >= WAITING:
+                    raise MessageError(f"{WAITING} requests wait already; ask again")
+                action = prepare(self._read(topic, model, payload))
+                self.enqueue(lambda: reply(query, action))
+
+            asked = ASKED_BY.set(_asker(query))
+            try:
+                reply(query, accept)
+            finally:
+                ASKED_BY.reset(asked)
+
+        self.zenoh.declare_queryable(key, received, complete=True)
+
+    def _read(self, topic: str, model: type[M], payload: bytes) -> M:
+        """Read a request. Raises MessageError."""
+        short = len(payload) <= topics.MESSAGE_BYTES and payload.count(b",") <= MAX_VALUES
+        may_be_long = topics.TOPICS[topic].request > topics.MESSAGE_BYTES
+        if may_be_long and not short and self._long.let_pass(topic) is None:
+            raise MessageError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
+        return model.decode(payload)
+
+    def enqueue(self, action: Action) -> None:
+        """Queue an action to run between two ticks; may be called from any thread."""
+        self._inbox.append(partial(copy_context().run, action))
+
+    def take_inbox(self) -> bool:
+        """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
+        waiting = min(AT_ONCE, len(self._inbox))
+        for _ in range(waiting):
+            self._inbox.popleft()()
+        return waiting > 0
+
     # ── liveliness ──
 
     def announce(self) -> None:
@@ -226,8 +198,7 @@ class Node:
     def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
         """Call back when a node's liveliness token appears (True) and disappears, in a thread of its own.
 
-        Returns the end of it. A token of another name calls no Python. Zenoh merges those of one name: the first
-        appears, the last disappears.
+        Returns the end of it. Zenoh merges tokens of one name: the first appears, the last disappears.
         """
         key = topics.key("alive", self.vehicle, role=name)
 
@@ -251,14 +222,8 @@ class Node:
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
-        json = topics.TOPICS[topic].kind == "json"
-        self._publishers[topic] = CachedPublisher(
-            self.zenoh,
-            topics.key(topic, self.vehicle, role=self.role),
-            per_s,
-            lossless=lossless,
-            encoding=zenoh.Encoding.APPLICATION_JSON if json else zenoh.Encoding.ZENOH_BYTES,
-        )
+        key, json = topics.key(topic, self.vehicle, role=self.role), topics.TOPICS[topic].kind == "json"
+        self._publishers[topic] = CachedPublisher(self.zenoh, key, per_s, lossless=lossless, json=json)
 
     def publish(self, topic: str, message: Message) -> None:
         """Publish a message on one of the table's JSON topics."""
@@ -332,13 +297,12 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
             return
         where = ""
         for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
-            if reply.ok is not None:
-                with suppress(ValidationError):
-                    where = f" ({Status.model_validate_json(reply.ok.payload.to_bytes()).process})"
-    raise OccupiedError(
-        f"{vehicle} has a plant already{where}; stop that one, or give this one a name of its own with "
-        "--set vehicle=NAME"
-    )
+            with suppress(MessageError):
+                where = (
+                    f" ({Status.decode(reply.ok.payload.to_bytes(), extra='ignore').process})" if reply.ok else where
+                )
+    remedy = "stop that one, or give this one a name of its own with --set vehicle=NAME"
+    raise NetworkError(f"{vehicle} has a plant already{where}; {remedy}")
 
 
 class RecorderWatch:

@@ -1,9 +1,4 @@
-"""Set-up of a real-time process: scheduling class, locked memory, CPU affinity, garbage between ticks, no lingering.
-
-Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
-second, which is warm-up, and stay. An idle CPU that sleeps takes long to wake; while a process keeps
-/dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
-"""
+"""Set-up of a real-time process: scheduling class, locked memory, CPU affinity, garbage between ticks, no lingering."""
 
 from __future__ import annotations
 
@@ -20,16 +15,12 @@ from typing import Final
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import LoopSettings
 
-PRIORITY: Final = 10
-"""Of SCHED_FIFO, above all that is not real-time and below the kernel's own threads, which have 50."""
+PRIORITY: Final = 10  # of SCHED_FIFO, above all that is not real-time and below the kernel's own threads, which have 50
 _PR_SET_TIMERSLACK: Final = 29
-_MCL_ALL: Final = 1 | 2
-"""MCL_CURRENT | MCL_FUTURE."""
+_MCL_ALL: Final = 1 | 2  # MCL_CURRENT | MCL_FUTURE
 _MCL_ONFAULT: Final = 4
-_YOUNG: Final = 700
-"""New objects after which the youngest generation is collected, which takes 0.04 to 0.3 ms."""
-_COLLECTIONS: Final = 4
-"""Collections of a generation after which the next older one is collected with it."""
+_YOUNG: Final = 700  # new objects after which the youngest generation is collected, which takes 0.04 to 0.3 ms
+_COLLECTIONS: Final = 4  # collections of a generation after which the next older one is collected with it
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
 
 
@@ -38,16 +29,11 @@ class RealtimeError(AeroloopError):
 
 
 def prepare_process(settings: LoopSettings) -> list[str]:
-    """Prepare this process for a loop: apply the real-time settings.
+    """Prepare this process for a loop: apply the real-time settings, unless `realtime` is off.
 
-    The garbage collector is switched off (see `collect_garbage`), the timer slack set to its minimum, memory locked,
-    the process bound to `cpus`, SCHED_FIFO requested, idle CPUs kept awake.
-
-    Returns:
-        One line for each setting that this host refused; nothing is requested with `realtime = "off"`.
-
-    Raises:
-        RealtimeError: A setting other than awake CPUs was refused, and `realtime` is strict.
+    The garbage collector is switched off (see `collect_garbage`), the timer slack set to its minimum, memory locked as
+    it is touched, the process bound to `cpus`, SCHED_FIFO requested, idle CPUs kept awake. Returns a line for each
+    setting that this host refused. Raises RealtimeError if one other than awake CPUs was, and `realtime` is strict.
     """
     if settings.realtime == "off":
         return []
@@ -74,7 +60,7 @@ def prepare_process(settings: LoopSettings) -> list[str]:
         refused.append(f"SCHED_FIFO {PRIORITY}: {error.strerror} (raise LimitRTPRIO)")
     if refused and settings.realtime == "strict":
         raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
-    try:
+    try:  # Linux, Documentation/power/pm_qos_interface.rst
         # Never closed: the kernel drops the request with the last descriptor, at the end of this process.
         os.write(os.open(_CPU_LATENCY, os.O_WRONLY), bytes(4))  # 0 µs, as the s32 that the kernel reads
     except OSError as error:
@@ -85,8 +71,8 @@ def prepare_process(settings: LoopSettings) -> list[str]:
 def collect_garbage() -> None:
     """Collect what garbage is due, where `prepare_process` switched Python's collector off; called after each tick.
 
-    Reference cycles, such as those of a user's law or plant, are garbage once they are dropped; without them hardly
-    anything is ever due. What was alive in `prepare_process` is not looked at, which would take 0.1 s.
+    Hardly anything is, but for reference cycles of a user's law or plant. What was alive in `prepare_process` is not
+    looked at, which would take 0.1 s.
     """
     young, collected, older = gc.get_count()
     if young > _YOUNG and not gc.isenabled():
@@ -111,10 +97,8 @@ def no_linger() -> str | None:
 
     Why: Zenoh sets it to 10 s on each (zenoh#2350, #2718, open). Closing a link whose peer no longer acknowledges then
     blocks the thread that also carries other peers' frames. A filter of system calls (seccomp(2)) answers that one
-    setting with success and leaves it undone; it looks at nothing else.
-
-    Such processes get no privileges that this one does not have (`PR_SET_NO_NEW_PRIVS`). Returns why this host
-    refuses; None if it does not.
+    setting with success and leaves it undone. Such processes get no privileges that this one does not have
+    (`PR_SET_NO_NEW_PRIVS`). Returns why this host refuses; None if it does not.
     """
     machine = _MACHINES.get(platform.machine())
     if machine is None or platform.system() != "Linux":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from collections.abc import Iterable
 from itertools import accumulate
 from math import exp2, log2
 from typing import Final, Protocol
@@ -26,7 +27,6 @@ class Clock(Protocol):
 class TickGrid:
     """Absolute deadlines: tick k is due at `start_ns + k·period_ns`, on `Clock.monotonic_ns`.
 
-    After a stall the grid continues at the next deadline ahead; it never bursts to catch up, because a plant does not.
     `tick` is the index of the last tick waited for, −1 before the first; `skipped` counts missed ticks.
     """
 
@@ -45,7 +45,8 @@ class TickGrid:
     def wait(self) -> int:
         """Sleep until the next tick is due and return its index.
 
-        A tick that is less than a period late is taken at once; after a longer stall, the next one ahead.
+        A tick that is less than a period late is taken at once. After a longer stall it is the next one ahead: the grid
+        never bursts to catch up, because a plant does not.
         """
         self.tick += 1
         now_ns = self._clock.monotonic_ns()
@@ -86,32 +87,24 @@ class Histogram:
     """Durations in bins 4.4 % wide (16 an octave, from 1 µs): memory stays bounded."""
 
     PER_OCTAVE: Final = 16
-    LONGEST_US: Final = 2.0**32 - 1  # over an hour, in the last bin
 
-    def __init__(self) -> None:
+    def __init__(self, parts: Iterable[Histogram] = ()) -> None:
         self._bins: Counter[int] = Counter()
         self.max_us = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of durations."""
-        return self._bins.total()
+        for part in parts:
+            self._bins.update(part._bins)
+            self.max_us = max(self.max_us, part.max_us)
 
     def add(self, nanoseconds: int) -> None:
-        """Count one duration [ns]; under 1 µs counts as 1 µs, over an hour as an hour."""
+        """Count one duration [ns]; under 1 µs counts as 1 µs."""
         us = nanoseconds * 1e-3
-        self._bins[int(log2(min(max(us, 1.0), self.LONGEST_US)) * self.PER_OCTAVE)] += 1
+        self._bins[int(log2(max(us, 1.0)) * self.PER_OCTAVE)] += 1
         self.max_us = max(self.max_us, us)
-
-    def merge(self, other: Histogram) -> None:
-        """Add the counts of another histogram."""
-        self._bins.update(other._bins)
-        self.max_us = max(self.max_us, other.max_us)
 
     def percentile(self, percent: float) -> float:
         """The middle of the bin that holds this percentile [µs]; NaN if nothing was counted."""
         bins = sorted(self._bins.items())
-        wanted = self.count * percent / 100
+        wanted = self._bins.total() * percent / 100
         for (i, _), seen in zip(bins, accumulate(n for _, n in bins), strict=True):
             if seen >= wanted:
                 return min(exp2((i + 0.5) / self.PER_OCTAVE), self.max_us)
@@ -119,10 +112,10 @@ class Histogram:
 
     def summary(self) -> Percentiles | None:
         """Percentiles for a status; None if nothing was counted."""
-        if not self.count:
+        if not self._bins:
             return None
         found = {name: round(self.percentile(at), 1) for name, at in (("p50", 50), ("p99", 99), ("p999", 99.9))}
-        return Percentiles(count=self.count, max=round(self.max_us, 1), **found)
+        return Percentiles(count=self._bins.total(), max=round(self.max_us, 1), **found)
 
 
 class RollingHistogram:
@@ -142,18 +135,12 @@ class RollingHistogram:
         self.total.add(nanoseconds)
         self._windows[-1].add(nanoseconds)
 
-    def turn_when_due(self) -> None:
-        """End a one-second window, if it is over; called with every report."""
+    def recent(self) -> Percentiles | None:
+        """Percentiles of the last ten windows; ends the newest one if it is a second old. Called with every status."""
         if (now_ns := self._clock.monotonic_ns()) - self._turned_ns >= self.SHORTEST_NS:
             self._turned_ns = now_ns
             self._windows.append(Histogram())
-
-    def recent(self) -> Histogram:
-        """The last ten windows."""
-        merged = Histogram()
-        for window in self._windows:
-            merged.merge(window)
-        return merged
+        return Histogram(self._windows).summary()
 
 
 class LoopTiming:
@@ -163,9 +150,7 @@ class LoopTiming:
     """
 
     def __init__(self, warm_up_ns: int = 1_000_000_000, clock: Clock = time) -> None:
-        self.wake = RollingHistogram(clock)
-        self.busy = RollingHistogram(clock)
-        self.period = RollingHistogram(clock)
+        self.wake, self.busy, self.period = (RollingHistogram(clock) for _ in range(3))
         self._clock = clock
         self._warm_up_ns = warm_up_ns
         self._warm_at: int | None = None
@@ -192,10 +177,7 @@ class LoopTiming:
         self._woke_at = 0
 
     def report(self) -> Timing:
-        """End a one-second window, and return all percentiles."""
-        found = {}
-        for name, durations in (("wake", self.wake), ("busy", self.busy), ("period", self.period)):
-            durations.turn_when_due()
-            found[name] = durations.total.summary()
-            found[f"recent_{name}"] = durations.recent().summary()
-        return Timing(**found)
+        """All percentiles."""
+        each = {"wake": self.wake, "busy": self.busy, "period": self.period}
+        recent = {f"recent_{name}": durations.recent() for name, durations in each.items()}
+        return Timing(**{name: durations.total.summary() for name, durations in each.items()}, **recent)

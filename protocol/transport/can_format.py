@@ -30,8 +30,7 @@ MAX_NODE: Final = 127
 CLASSIC_BYTES: Final = 8
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 HEARTBEAT_S: Final = 0.1
-SILENT_S: Final = 0.5
-"""A peer from which nothing is received for this long, five heartbeats, is gone [s]."""
+SILENT_S: Final = 0.5  # a peer from which nothing is received for this long, five heartbeats, is gone [s]
 
 _STATES: Final = list(PlantState)
 _CAUSES: Final = list(TripCause)
@@ -66,12 +65,12 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
     """Raise CanError if a frame does not fit the bus, with what to do."""
     bus, longest = ("CAN FD", FD_LENGTHS[-1]) if settings.fd else ("classic CAN", CLASSIC_BYTES)
     or_fd = "" if settings.fd else ", or set can.fd = true"
-    for name, frame, signals in (
-        ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
-        ("command", wire.command, "wire.voltage.bits"),
-    ):
-        if frame.size > longest:
-            problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
+    for name, signals in {
+        "measurement": "wire.attitude.bits and wire.rate.bits",
+        "command": "wire.voltage.bits",
+    }.items():
+        if (size := getattr(wire, name).size) > longest:
+            problem = f"a {name} frame has {size} bytes, and a {bus} frame holds {longest}"
             raise CanError(f"{problem}: lower {signals}{or_fd}")
 
 

@@ -36,35 +36,31 @@ _SEND_S: Final = 0.002
 _REOPEN_S: Final = 0.5
 _UNSENT: Final = 20  # failed sends in a row after which the bus counts as lost
 
-End = Literal["plant", "controller"]
-
 
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives. In lockstep an empty frame is silence.
 
-    `peer` is the other end's last heartbeat, or None; `fault` says why the bus cannot be used, until `reopen` clears
-    it. `errors` counts error frames, failed sends and receives, `refused` malformed frames and heartbeats. Raises
-    CanError if the bus cannot be opened, or a frame does not fit it.
+    `peer` is the other end's last heartbeat, or None; `fault` says why the bus cannot be used, as after repeated
+    failures to send, until `reopen` clears it. `errors` counts error frames, failed sends and receives, `refused`
+    malformed frames and heartbeats. Raises CanError if the bus cannot be opened, or a frame does not fit it.
     """
 
     def __init__(
         self,
         settings: CanSettings,
         wire: WireSpec,
-        end: End,
+        end: Literal["plant", "controller"],
         changed: threading.Condition | None = None,
         *,
         lockstep: bool = False,
     ) -> None:
         check_widths(settings, wire)
         super().__init__(changed)
+        plant, controller = (MEASUREMENT_ID, PLANT_HEARTBEAT_ID), (COMMAND_ID, CONTROLLER_HEARTBEAT_ID)
+        sent, taken = (plant, controller) if end == "plant" else (controller, plant)
         received: Literal["measurement", "command"] = "command" if end == "plant" else "measurement"
-        sent = [MEASUREMENT_ID + settings.node, PLANT_HEARTBEAT_ID + settings.node]
-        taken = [COMMAND_ID + settings.node, CONTROLLER_HEARTBEAT_ID + settings.node]
-        if end == "controller":
-            sent, taken = taken, sent
-        self._send_id, self._beat_id = sent
-        self._receive_id, self._peer_beat_id = taken
+        self._send_id, self._beat_id = (each + settings.node for each in sent)
+        self._receive_id, self._peer_beat_id = (each + settings.node for each in taken)
         self._settings = settings
         self._size = getattr(wire, received).size
         self._may_be_silent = len(UNCHANGED) in wire.lengths(received, lockstep=lockstep)
@@ -78,7 +74,6 @@ class CanLink(Link):
         self._connect()
 
     def send(self, frame: bytes) -> None:
-        """Send a frame. Repeated failures set `fault`; never an exception."""
         self._put(self._send_id, frame)
 
     def beat(self, heartbeat: Heartbeat) -> None:
@@ -113,7 +108,6 @@ class CanLink(Link):
         return False
 
     def close(self) -> None:
-        """Stop receiving, and leave the bus."""
         if self._open:
             self._open = False
             self._receiver.join(5 * _RECEIVE_S)
@@ -123,14 +117,12 @@ class CanLink(Link):
     # ── the bus ──
 
     def _connect(self) -> None:
-        settings = self._settings
+        bus = self._settings
         try:
-            self._bus = can.Bus(
-                channel=settings.channel, interface=settings.interface, fd=settings.fd, **settings.options
-            )
+            self._bus = can.Bus(channel=bus.channel, interface=bus.interface, fd=bus.fd, **bus.options)
         except (can.CanError, OSError, ValueError, TypeError) as error:
-            bus = f"{settings.interface}:{settings.channel}"
-            raise CanError(f"cannot open the CAN bus {bus}: {str(error).splitlines()[0]}") from None
+            where = f"{bus.interface}:{bus.channel}"
+            raise CanError(f"cannot open the CAN bus {where}: {str(error).splitlines()[0]}") from None
         self._open, self.fault, self._unsent = True, None, 0
         self._receiver = threading.Thread(target=self._receive, args=(self._bus,), name="can", daemon=True)
         self._receiver.start()

@@ -1,4 +1,4 @@
-"""Certificate of a role: reads one, checks this process's own before it is used, and finds why links are refused.
+"""Certificate of a role: finds, reads and checks one before it is used.
 
 A host's directory has `ca.pem`, the certificate of the private authority, and for each role that runs there
 `ROLE.VEHICLE.pem` with `ROLE.VEHICLE.key`; `ROLE.pem` with `ROLE.key` where the certificate is good for every vehicle.
@@ -10,9 +10,6 @@ connecting side trusts every public authority besides `ca.pem`.
 
 from __future__ import annotations
 
-import socket
-import ssl
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,7 +18,6 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.endpoint import Endpoint
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -30,11 +26,10 @@ if TYPE_CHECKING:
 
 ROUTER: Final = "router"
 ROLES: Final[tuple[str, ...]] = (*topics.ROLES, ROUTER)
-OF_ONE_VEHICLE: Final = ("plant", "controller")
-"""Roles whose certificates name a vehicle; the others' may."""
+OF_ONE_VEHICLE: Final = ("plant", "controller")  # roles whose certificates name a vehicle; the others' may
 AUTHORITY: Final = "ca.pem"
-SOON_DAYS: Final = 14.0
-"""A certificate that expires within this time is due for renewal [days]."""
+SOON_DAYS: Final = 14.0  # a certificate that expires within this time is due for renewal [days]
+_UTC: Final = "%Y-%m-%d %H:%M:%S UTC"
 _ISSUE: Final = "`aeroloop host keys issue` makes one"
 _AGAIN: Final = "move it and its key away, and issue it anew with `aeroloop host keys issue`"
 
@@ -74,7 +69,7 @@ class Certificate:
 
 
 def common_name(role: str, vehicle: str | None) -> str:
-    """Common name of a certificate of a role, of one vehicle or of every one (None)."""
+    """Common name of a role's certificate, of one vehicle or of every one (None)."""
     return role if vehicle is None else f"{role}/{vehicle}"
 
 
@@ -88,7 +83,7 @@ def read_common_name(text: str) -> tuple[str, str | None] | None:
 
 def file_of(directory: Path, role: str, vehicle: str | None) -> Path:
     """File of a role's certificate."""
-    return directory / f"{role if vehicle is None else f'{role}.{vehicle}'}.pem"
+    return directory / f"{common_name(role, vehicle).replace('/', '.')}.pem"
 
 
 def load(file: Path) -> x509.Certificate:
@@ -116,10 +111,8 @@ def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) 
     The best role comes first; `vehicle` is None if any will do. Raises CertificateError if there is none that is good.
     """
     if not (directory / AUTHORITY).is_file():
-        raise CertificateError(
-            f"{directory / AUTHORITY} is missing, without which no peer is trusted: copy it from where "
-            "`aeroloop host keys init` made it"
-        )
+        remedy = "copy it from where `aeroloop host keys init` made it"
+        raise CertificateError(f"{directory / AUTHORITY} is missing, without which no peer is trusted: {remedy}")
     for role in roles:
         files = [file_of(directory, role, each) for each in dict.fromkeys((vehicle, None))]
         files += sorted(directory.glob(f"{role}.*.pem")) if vehicle is None else []
@@ -127,10 +120,8 @@ def own_certificate(directory: Path, roles: Sequence[str], vehicle: str | None) 
             if file.is_file():
                 return check(file, role, vehicle)
     option = f" --vehicle {vehicle or 'V'}" if vehicle or roles[0] in OF_ONE_VEHICLE else ""
-    raise CertificateError(
-        f"{file_of(directory, roles[0], vehicle)} is missing: issue it with "
-        f"`aeroloop host keys issue {roles[0]} NAME{option}`"
-    )
+    remedy = f"`aeroloop host keys issue {roles[0]} NAME{option}`"
+    raise CertificateError(f"{file_of(directory, roles[0], vehicle)} is missing: issue it with {remedy}")
 
 
 def check(file: Path, role: str, vehicle: str | None) -> Certificate:
@@ -160,15 +151,10 @@ def check(file: Path, role: str, vehicle: str | None) -> Certificate:
     try:
         found.x509.verify_directly_issued_by(load(file.parent / AUTHORITY))
     except (InvalidSignature, ValueError, TypeError):  # another name, another kind of key
-        problem = f"{file} was not issued by {AUTHORITY} beside it: both must be of one authority; {_ISSUE}"
-        raise CertificateError(problem) from None
-    if found.not_after < now:
-        raise CertificateError(f"{file} expired at {_utc(found.not_after)}: {_AGAIN}")
-    if begin > now:
-        raise CertificateError(
-            f"{file} is not valid before {_utc(begin)}, and this host's clock shows {_utc(now)}: set the clock, "
-            f"or {_AGAIN}"
-        )
+        raise CertificateError(f"{file} was not issued by {AUTHORITY} beside it; {_ISSUE}") from None
+    if not begin <= now <= found.not_after:
+        what = f"expired at {found.not_after:{_UTC}}" if begin < now else f"is not valid before {begin:{_UTC}}"
+        raise CertificateError(f"{file} {what}, and this host's clock shows {now:{_UTC}}: set the clock, or {_AGAIN}")
     return found
 
 
@@ -183,54 +169,3 @@ def subject_field(certificate: x509.Certificate, field: Literal["CN", "OU"]) -> 
     """A field of the subject; empty where there is none."""
     fields = [each for each in certificate.subject if each.rfc4514_attribute_name == field]
     return str(fields[0].value) if fields else ""
-
-
-def _utc(time: datetime) -> str:
-    return f"{time:%Y-%m-%d %H:%M:%S} UTC"
-
-
-# ── why a link does not come about ──
-
-HANDSHAKE_S: Final = 0.5  # how long a command waits for a message of a handshake; usual is a millisecond
-PLAIN_S: Final = 3.0  # for a peer of Zenoh without TLS, which hangs up after 2 s; a halted process does not
-_EXPIRED: Final = "compare the clocks, or issue it anew with `aeroloop host keys issue`"
-_THEIRS: Final = {9: f"is not yet valid by this host's clock: {_EXPIRED}", 10: f"has expired: {_EXPIRED}"}  # x509_vfy.h
-_OURS: Final = {"EXPIRED": f"expired or not yet valid by its clock: {_EXPIRED}", "UNKNOWN_CA": "not of its authority"}
-
-
-def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -> str | None:
-    """One line about why a peer at an endpoint of TLS and a process with this certificate do not link.
-
-    None if nothing speaks against it, and where no process answers. Zenoh writes the reason only into its own log. TLS
-    1.3 shows a client at once what is wrong with the server's certificate, and in an alert, after the handshake, what
-    the server has against its own.
-    """
-    endpoint = Endpoint.parse(text)
-    if endpoint.protocol != "tls":
-        return None
-    authority = certificate.file.with_name(AUTHORITY)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # as Zenoh here: names of hosts do not matter
-    plain_text = f"{text} does not speak TLS: has its process a network.security.directory?"
-    link, begun = None, time.monotonic()
-    try:
-        context.load_verify_locations(authority)
-        context.load_cert_chain(certificate.file, certificate.key)
-        with socket.create_connection(endpoint.address, HANDSHAKE_S) as plain:
-            plain.settimeout(wait_s)
-            begun = time.monotonic()
-            with context.wrap_socket(plain) as link:
-                link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
-    except ssl.SSLCertVerificationError as error:
-        why = _THEIRS.get(error.verify_code, f"is not of this authority, {authority}")
-        return f"{text} is refused: its certificate {why}"
-    except (ssl.SSLEOFError, ConnectionError):  # at once: it ends, or nothing listens
-        return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
-    except ssl.SSLError as error:
-        alert = error.reason or ""
-        why = next((words for name, words in _OURS.items() if name in alert), alert.lower().replace("_", " "))
-        return f"{text} refuses the certificate {certificate.file}: {why}" if "ALERT" in alert else plain_text
-    except OSError:  # no answer in time; files that were just replaced
-        return None
-    return None

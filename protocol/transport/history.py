@@ -1,8 +1,7 @@
 """History: numbered messages, the last of which their publisher keeps, and a subscriber that queries what it lacks.
 
-A message is dropped where a peer does not keep up: no publisher ever waits. A subscriber hands on what it receives at
-once, in the order of arrival, and keeps for each publisher the ranges of numbers that it lacks. It queries these a page
-at a time, the newest first, so no more is under way than a slow link carries.
+A message is dropped where a peer does not keep up: no publisher ever waits. A subscriber keeps for each publisher the
+ranges of numbers that it lacks, and queries them a page at a time, so no more is under way than a slow link carries.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import struct
 import time
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import ceil, inf
@@ -66,7 +65,7 @@ def read_sample(sample: zenoh.Sample) -> Delivery:
     return Delivery(key, payload, number, max(0, clock_ns), publisher)
 
 
-def query(ranges: Sequence[tuple[int, Range]]) -> bytes:
+def query(ranges: Iterable[tuple[int, Range]]) -> bytes:
     """Query of caches: publishers, each with a range that is wanted, the most wanted first."""
     return b"".join(_RANGE.pack(publisher, *each) for publisher, each in ranges)
 
@@ -95,19 +94,14 @@ class CachedPublisher:
     """Publishes on one key, from any thread, and answers for the last messages. The session outlives the publisher.
 
     `per_s` bounds the messages per second, in the long run. If `lossless`, for lockstep, it waits for peers that do not
-    keep up instead of dropping.
+    keep up instead of dropping. `json` is whether the messages are JSON.
     """
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        key: str,
-        per_s: float,
-        *,
-        lossless: bool = False,
-        encoding: zenoh.Encoding = zenoh.Encoding.APPLICATION_JSON,
+        self, session: zenoh.Session, key: str, per_s: float, *, lossless: bool = False, json: bool = True
     ) -> None:
         control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        encoding = zenoh.Encoding.APPLICATION_JSON if json else zenoh.Encoding.ZENOH_BYTES
         self._publisher = session.declare_publisher(key, encoding=encoding, congestion_control=control)
         self._id, self._count = secrets.randbits(64), 0
         self._kept: deque[tuple[int, int, bytes]] = deque(maxlen=ceil(KEPT_S * per_s))
@@ -161,10 +155,7 @@ class _Source:
 
 
 class RecoveringSubscriber:
-    """Subscriber that queries publishers' caches for what it did not receive. The session outlives it.
-
-    `clock` is monotonic [s].
-    """
+    """Subscriber that queries publishers' caches for what it did not receive. The session outlives it; `clock` in s."""
 
     def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._session, self._cache_key, self._clock, self._lock = session, topics.cache_key(key), clock, Lock()
@@ -175,10 +166,9 @@ class RecoveringSubscriber:
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def take(self) -> list[Delivery]:
-        """Messages that wait, each once, in the order of arrival. Never waits.
+        """Messages that wait, each once, in the order of arrival; also queries the caches when that is due.
 
-        Also queries the caches, if the last query is answered: 25 ms later while pages bring messages, else twice a
-        second.
+        A query is due once the last is answered: 25 ms later while pages bring messages, else twice a second.
         """
         paging = self._paged >= self._asked
         due = self._asked + (SOON_S if paging else SELDOM_S)
@@ -212,8 +202,7 @@ class RecoveringSubscriber:
     def _age(self, source: _Source) -> float:
         return self._clock() - source.seen
 
-    def _reachable(self, source: _Source) -> bool:
-        """Whether it was silent for less than two time-outs: a query or page that is dropped is repeated once."""
+    def _reachable(self, source: _Source) -> bool:  # two time-outs: a query or page that is dropped is repeated once
         return self._age(source) < 2 * ANSWER_S
 
     def _query(self) -> None:

@@ -1,7 +1,7 @@
-"""Links: carry frames between the two ends, without a queue.
+"""Links: carry frames between the two ends, without a queue, by the same calls on every transport.
 
-Both ends use the same calls on every transport. A received frame replaces one that was not yet taken: a loop needs the
-newest sample, and a queue would only delay it. A frame of a wrong length is refused before it could replace one.
+A received frame replaces one that was not yet taken: a loop needs the newest sample, and a queue would only delay it. A
+frame of a wrong length is refused before it could replace one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Container
 from threading import Condition
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh.handlers import Callback
@@ -25,10 +25,9 @@ class Arrival(NamedTuple):
 
 
 class Mailbox:
-    """A slot for frames, written by a receiving thread and read by the loop; a new frame replaces the oldest.
+    """A slot for `depth` frames, written by a receiving thread and read by the loop; a new frame replaces the oldest.
 
-    `changed` is notified when a frame is put; several mailboxes of one reader may share it. `depth` is how many frames
-    it holds, for a reader that needs each of them; the oldest is taken first.
+    `changed` is notified when a frame is put; several mailboxes of one reader may share it.
     """
 
     def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
@@ -73,12 +72,9 @@ class Link(Mailbox, ABC):
 class ZenohLink(Link):
     """Frames over Zenoh: express, at real-time priority. The session outlives the link.
 
-    Zenoh's receiving thread fills the mailbox, so times of arrival are exact. `lengths` are those of the frames
-    received [bytes]; `refused` counts frames of any other. If `lossless`, `send` blocks when a peer does not keep up,
-    instead of dropping: for lockstep, where each frame is waited for.
-
-    A plant's link may have a second session, `also`: frames are received on both, and sent on each that has a
-    subscriber, which the controller has on one.
+    `lengths` are those of the frames received [bytes]; `refused` counts frames of any other. If `lossless`, `send`
+    blocks when a peer does not keep up, instead of dropping: for lockstep, where each frame is waited for. A plant's
+    link may have a second session, `also`: frames are received on both, and sent on that which has a subscriber.
     """
 
     def __init__(
@@ -106,24 +102,20 @@ class ZenohLink(Link):
 
         handler = Callback(receive, indirect=False)  # in Zenoh's thread: one of Python's would be one wake-up more
         self._subscribers = [each.declare_subscriber(receive_key, handler) for each in sessions]
-        self._publishers = [
-            each.declare_publisher(
-                send_key,
-                priority=zenoh.Priority.REAL_TIME,
-                congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-                reliability=zenoh.Reliability.RELIABLE if lossless else zenoh.Reliability.BEST_EFFORT,
-                express=True,
-            )
-            for each in sessions
-        ]
+        control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        reliability = zenoh.Reliability.RELIABLE if lossless else zenoh.Reliability.BEST_EFFORT
+        how: dict[str, Any] = {
+            "priority": zenoh.Priority.REAL_TIME,
+            "congestion_control": control,
+            "reliability": reliability,
+        }
+        self._publishers = [each.declare_publisher(send_key, express=True, **how) for each in sessions]
 
     def send(self, frame: bytes) -> None:
-        """Send a frame."""
         for publisher in self._publishers:
             publisher.put(frame)
 
     def close(self) -> None:
-        """Stop receiving."""
         while self._subscribers:
             self._subscribers.pop().undeclare()
         while self._publishers:

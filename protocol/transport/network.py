@@ -1,24 +1,21 @@
 """Network: opens Zenoh's sessions of this process, peer to peer or at a router, without multicast.
 
 Every peer listens at the first free of `PORTS` consecutive ports from a rendezvous on, and connects to those below, as
-those above connect to it, and to all of other rendezvous. So a newcomer joins at any process that answers, and no
-process is needed by the others: order of start, end or halt of any of them does not matter. Peers also learn each
-other's addresses by gossip.
-
-Why not all to all: a process that is halted for longer than the lease, and connects as it goes on, adds that link to
-its session with a peer that has ended the session. Neither would get what the other has declared. The end of a pair
-that connects does so only once its own session has ended, and the other end accepts no second link.
-
-A client links to a router alone, does not listen, and waits until there is one. An operator's command does not listen
-either, and finds which processes accept a connection but do not answer.
+those above connect to it, and to all of other rendezvous. So a newcomer joins at any process that answers, and none is
+needed by the others. Why not all to all: a process that is halted for longer than the lease, and connects as it goes
+on, adds that link to its session with a peer that has ended the session; neither would get what the other has declared.
+The end of a pair that connects does so once its own session has ended, and the other end accepts no second link.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import socket
+import ssl
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from math import inf
@@ -26,11 +23,12 @@ from typing import Any, Final
 
 import zenoh
 
-from aeroloop.protocol.transport.certificate import Certificate, refusal
-from aeroloop.protocol.transport.endpoint import Endpoint, accepting
+from aeroloop.protocol.transport.certificate import AUTHORITY, Certificate
 from aeroloop.protocol.transport.network_settings import (
     PORTS,
     READER,
+    STREAMS,
+    Endpoint,
     Identity,
     NetworkError,
     NetworkSettings,
@@ -40,17 +38,18 @@ from aeroloop.protocol.transport.network_settings import (
 from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, router_config, zenoh_config
 
 log: Final = logging.getLogger("aeroloop")
-COMMAND_S: Final = 0.5
-"""How long a command waits for a process that accepts a connection to answer [s]; usual is some 10 ms."""
-DECLARED_S: Final = 0.1
-"""Declarations follow a new link within this time [s]; usual is a millisecond."""
+COMMAND_S: Final = 0.5  # how long a command waits for a process that accepts a connection to answer; usual is 10 ms
+DECLARED_S: Final = 0.1  # declarations follow a new link within this time; usual is a millisecond
+ACCEPT_S: Final = 0.25  # how long `accepting` waits for a connection
+HANDSHAKE_S: Final = 0.5  # how long a command waits for a message of a TLS handshake; usual is a millisecond
+PLAIN_S: Final = 3.0  # the same for a peer of Zenoh without TLS, which hangs up after 2 s; a halted process does not
 POLL_S: Final = 0.005
 ROUTER_AGAIN_S: Final = 0.2  # pause before a client that finds no router looks again
 ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time without a router: it may have started first
 
 
 def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
-    """Open a session that meets the others at the rendezvous. The caller closes it.
+    """Open a session that meets the others at the rendezvous, or at a router as soon as one answers. Close it.
 
     `listen` is whether others can connect to it: yes for a role, no for a command that only queries. Raises
     NetworkError if an endpoint cannot be opened as configured, CertificateError for want of a good certificate.
@@ -72,10 +71,9 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
     try:
         return _open(zenoh_config(network, "peer", [*further, *any_port] if listen else [], meeting))
     except zenoh.ZError as error:
-        raise NetworkError(
-            f"cannot listen on {', '.join(further)}: {_reason(error)}; give free ones with --set network.listen="
-            f"'{json.dumps([str(Endpoint.parse(each).at_port(0)) for each in settings.listen])}'"
-        ) from None
+        free = json.dumps([str(Endpoint.parse(each).at_port(0)) for each in settings.listen])
+        problem = f"cannot listen on {', '.join(further)}: {_reason(error)}"
+        raise NetworkError(f"{problem}; give free ones with --set network.listen='{free}'") from None
 
 
 def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
@@ -86,17 +84,13 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     try:
         return _open(config)
     except zenoh.ZError as error:
-        raise NetworkError(
-            f"cannot listen on {', '.join(config['listen']['endpoints']) or 'nothing'}: {_reason(error)}; "
-            "name a free endpoint of this host in network.rendezvous or network.listen"
-        ) from None
+        problem = f"cannot listen on {', '.join(config['listen']['endpoints']) or 'nothing'}: {_reason(error)}"
+        remedy = "name a free endpoint of this host in network.rendezvous or network.listen"
+        raise NetworkError(f"{problem}; {remedy}") from None
 
 
 class CommandSession:
-    """A session of a command: it has no endpoint of its own, and links to every process that answers.
-
-    `certificate` is its own; None where no link needs one.
-    """
+    """A command's session: it does not listen, and links to every process that answers. `certificate` is its own."""
 
     def __init__(self, session: zenoh.Session, endpoints: list[str], certificate: Certificate | None) -> None:
         self.session = session
@@ -113,8 +107,7 @@ class CommandSession:
     def unanswered(self) -> list[str]:
         """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
 
-        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
-        Zenoh's listener of TLS accepts none for 0.1 s.
+        Each without a link is tried once: after a try Zenoh's listener of TLS accepts no connection for 0.1 s.
         """
         if self._accepting is None:
             self._accepting = accepting(self._unlinked(self._endpoints))
@@ -132,10 +125,9 @@ def command_session(
 ) -> Iterator[CommandSession]:
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
-    Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
     Errors are those of `join`, and NetworkError if it is a client's and no router answers.
     """
-    wait_ms = round(wait_s * 1000)
+    wait_ms = round(wait_s * 1000)  # of one attempt to connect, as closing a session waits for a handshake in progress
     network = protected(settings, identity)
     meeting = network.settings.rendezvous_endpoints
     try:
@@ -154,18 +146,15 @@ def command_session(
 class FrameSession:
     """A second session of a loop's two ends, which carries their frames over UDP; none on loopback, or if not set.
 
-    Over TCP, and so over TLS, one lost packet holds back all that follow until it has been sent again: 0.2 s and more,
-    in which the plant's watchdog trips. A lost frame needs nothing: the next one replaces it. So between hosts frames
-    get a session of their own: a QUIC connection, whose datagrams carry them and whose stream carries what Zenoh
-    declares. Why not a second link of the first session: its first link carries the declarations, and if that is UDP,
-    a lost packet costs a subscription for good.
+    Over TCP, and so over TLS, one lost packet holds back all that follow for 0.2 s and more, in which the plant's
+    watchdog trips. So between hosts frames are datagrams of a QUIC connection, whose stream has what Zenoh
+    declares: it would get lost with UDP as the first link of one session for all.
 
     The plant listens at the first free port of its host's endpoints, by UDP, and names the `endpoint` in its status.
     The controller connects to it before it claims; without such a link its frames stay on the first session.
     """
 
-    LINK_S = 5.0
-    """How long claims wait for the link to a plant [s]: at 20 % loss a handshake takes up to 4 s, usually 0.02 s."""
+    LINK_S = 5.0  # how long claims wait for the link to a plant: a handshake takes 0.02 s, and up to 4 s at 20 % loss
 
     def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
         self._network = protected(settings, identity)
@@ -269,3 +258,54 @@ def _open(config: dict[str, Any]) -> zenoh.Session:
 def _reason(error: Exception) -> str:
     """Zenoh's message without the source locations it carries."""
     return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")
+
+
+def accepting(endpoints: Sequence[str]) -> list[str]:
+    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
+
+    def accepts(text: str) -> bool:
+        endpoint = Endpoint.parse(text)
+        if endpoint.protocol in STREAMS and endpoint.port is not None:
+            with suppress(OSError), socket.create_connection(endpoint.address, ACCEPT_S):
+                return True
+        return False
+
+    with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
+        found = pool.map(accepts, endpoints)
+        return [text for text, accepted in zip(endpoints, found, strict=True) if accepted]
+
+
+def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -> str | None:
+    """One line about why a peer at an endpoint of TLS and a process with this certificate do not link.
+
+    None if nothing speaks against it, and where no process answers. Zenoh writes the reason only into its own log. TLS
+    1.3 shows a client at once what is wrong with the server's certificate, and in an alert, after the handshake, what
+    the server has against its own.
+    """
+    endpoint = Endpoint.parse(text)
+    if endpoint.protocol != "tls":
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # as Zenoh here: names of hosts do not matter
+    remedy = f"compare the clocks and {AUTHORITY} of both hosts, or issue it anew with `aeroloop host keys issue`"
+    plain_text = f"{text} does not speak TLS: has its process a network.security.directory?"
+    link, begun = None, time.monotonic()
+    try:
+        context.load_verify_locations(certificate.file.with_name(AUTHORITY))
+        context.load_cert_chain(certificate.file, certificate.key)
+        with socket.create_connection(endpoint.address, HANDSHAKE_S) as plain:
+            plain.settimeout(wait_s)
+            begun = time.monotonic()
+            with context.wrap_socket(plain) as link:
+                link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
+    except ssl.SSLCertVerificationError as error:
+        return f"{text} is refused: its certificate: {error.verify_message}; {remedy}"
+    except (ssl.SSLEOFError, ConnectionError):  # at once: it ends, or nothing listens
+        return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
+    except ssl.SSLError as error:
+        alert = (error.reason or "").lower().replace("_", " ")
+        return f"{text} refuses {certificate.file}: {alert}; {remedy}" if "alert" in alert else plain_text
+    except OSError:  # no answer in time; files that were just replaced
+        return None
+    return None

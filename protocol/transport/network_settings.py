@@ -1,13 +1,17 @@
 """Network settings: where a process meets the others, and which of its links become mutual TLS.
 
 An endpoint of TCP beyond loopback becomes one of TLS; on loopback it stays as it is, so `tls/127.0.0.1:7447` is mutual
-TLS on this host, too. A process uses the certificate of its role and vehicle, to connect and to listen. Names of hosts
-do not matter: what a peer may do follows from its certificate's common name alone.
+TLS on this host, too. Names of hosts do not matter: what a peer may do follows from its certificate's common name.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+import socket
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
@@ -16,23 +20,99 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.topics import NAME
 from aeroloop.protocol.transport.certificate import Certificate, own_certificate
-from aeroloop.protocol.transport.endpoint import TLS, Endpoint
 
-PORTS: Final = 8
-"""Consecutive ports from each rendezvous' port on that processes meet at: one that hangs keeps none out."""
+PORTS: Final = 8  # consecutive ones from each rendezvous on that processes meet at: one that hangs keeps none out
+TLS: Final = ("tls", "quic")  # links are encrypted, both ends with a certificate
+STREAMS: Final = ("tcp", "tls")
+LOCAL: Final = ("unixsock-stream", "unixpipe", "shm")  # stays on this host; the file's mode says who may connect
+_FORM: Final = re.compile(
+    r"(?P<protocol>[a-z][a-z0-9_-]*)/(?P<host>\[[^]]*\]|[^:?#\s]+)(:(?P<port>\d+))?(?P<words>[?#]\S*)?"
+)
 
 
 class NetworkError(AeroloopError):
     """The network cannot be joined as configured; one line with the reason and what to do."""
 
 
-def _endpoint(text: str) -> str:
-    if text:
-        Endpoint.parse(text)
-    return text
+@dataclass(frozen=True)
+class Endpoint:
+    """An endpoint. An IPv6 `host` is in brackets, that of a Unix socket is a path; `words` begin with `?` or `#`."""
+
+    protocol: str
+    host: str
+    port: int | None
+    words: str = ""
+
+    @staticmethod
+    @lru_cache(maxsize=256)
+    def parse(text: str) -> Endpoint:
+        """The endpoint that a text names. Raises ValueError if it names none."""
+        if (found := _FORM.fullmatch(text)) is None:
+            raise ValueError("must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447")
+        port = found["port"]
+        return Endpoint(found["protocol"], found["host"], None if port is None else int(port), found["words"] or "")
+
+    def __str__(self) -> str:
+        port = "" if self.port is None else f":{self.port}"
+        return f"{self.protocol}/{self.host}{port}{self.words}"
+
+    def at_port(self, port: int) -> Endpoint:
+        """The same with another port; itself where it has none."""
+        return self if self.port is None else replace(self, port=port)
+
+    def ports(self, count: int) -> list[Endpoint]:
+        """The endpoints of consecutive ports from this one's on; itself where it has no port."""
+        if self.port is None:
+            return [self]
+        return [self.at_port(port) for port in range(self.port, min(self.port + count, 1 << 16))]
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port as sockets take them; port 0 where it has none."""
+        return self.host.strip("[]"), self.port or 0
+
+    @property
+    def on_loopback(self) -> bool:
+        """Whether its links stay within this host."""
+        if self.protocol in LOCAL or self.host == "localhost":
+            return True
+        try:
+            return ip_address(self.address[0]).is_loopback
+        except ValueError:  # a name
+            return False
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its links are plain text that leaves this host, or may."""
+        return self.protocol not in TLS and not self.on_loopback
+
+    @property
+    def leaves_host(self) -> bool:
+        """Whether it is one of TCP or TLS beyond loopback."""
+        return self.protocol in STREAMS and not self.on_loopback
+
+    @property
+    def is_free(self) -> bool:
+        """Whether this process could listen at it: it is an address of this host, and its port is free."""
+        if self.port is None:
+            return True  # only Zenoh can find out
+        family = socket.AF_INET6 if self.host.startswith("[") else socket.AF_INET
+        with suppress(OSError):
+            if self.protocol in ("udp", "quic"):
+                with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                    probe.bind(self.address)
+            else:
+                socket.create_server(self.address, family=family).close()
+            return True
+        return False
+
+    @property
+    def is_own(self) -> bool:
+        """Whether its address is this host's."""
+        return self.at_port(0).is_free
 
 
-EndpointText = Annotated[str, AfterValidator(_endpoint)]
+EndpointText = Annotated[str, AfterValidator(lambda text: str(Endpoint.parse(text)) if text else text)]
 
 
 class SecuritySettings(BaseModel, extra="forbid"):
@@ -43,7 +123,6 @@ class SecuritySettings(BaseModel, extra="forbid"):
         description="folder of this host's certificates, as `aeroloop host keys` makes it; every link beyond loopback "
         "is then mutual TLS; empty for none",
     )
-
     vehicles: list[Annotated[str, Field(pattern=f"^{NAME}$")]] = Field(
         default=[],
         description="vehicles whose peers have rights here; the configured one always, further ones for a recorder, an "
@@ -114,8 +193,7 @@ class Identity(NamedTuple):
     vehicle: str | None = None
 
 
-READER: Final = Identity(("operator", "observer"))
-"""A command or a viewer, of any vehicle."""
+READER: Final = Identity(("operator", "observer"))  # a command or a viewer, of any vehicle
 
 
 class Protected(NamedTuple):
@@ -155,13 +233,10 @@ def opened(text: str, settings: NetworkSettings) -> str:
         if endpoint.is_plain and endpoint.protocol != "tcp":
             raise NetworkError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
         return str(replace(endpoint, protocol="tls")) if endpoint.is_plain else text
+    remedy = "make certificates with `aeroloop host keys`, and set network.security.directory"
     if endpoint.protocol in TLS:
-        raise NetworkError(
-            f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
-        )
+        raise NetworkError(f"{endpoint} needs certificates: {remedy}")
     if endpoint.is_plain and not settings.insecure:
-        raise NetworkError(
-            f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
-            "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"
-        )
+        problem = f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle"
+        raise NetworkError(f"{problem}: {remedy}; or set network.insecure = true on a network of your own")
     return text

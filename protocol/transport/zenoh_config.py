@@ -2,12 +2,9 @@
 
 Zenoh checks every message of a link, both ways, by the common name of the peer's certificate, whichever end connected.
 What no rule allows is dropped without a sign; so are messages of and to a peer of another vehicle, or of no role. The
-rules are the table of topics: which messages a session takes from each peer and sends to it. A role's own name stands
-in the keys it sends on. A plain link on loopback is unrestricted. A router has the same
-rules, and every end lets a router pass what it has checked.
-
-A rule's key must include the message's. So readers may name all vehicles in one key (`aeroloop/*/status/*`), which
-brings them nothing of vehicles without rules; what acts names its vehicle.
+rules are the table of topics: which messages a session takes from each peer and sends to it. A router has the same
+rules, and every end lets a router pass what it has checked. A rule's key must include the message's, so readers may
+name all vehicles in one key (`aeroloop/*/status/*`); what acts names its vehicle.
 """
 
 from __future__ import annotations
@@ -19,9 +16,8 @@ from typing import Any, Final, Literal
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ACTIONS, TOPICS, Action, Topic
 from aeroloop.protocol.transport.certificate import AUTHORITY, OF_ONE_VEHICLE, ROLES, ROUTER, Certificate, common_name
-from aeroloop.protocol.transport.endpoint import TLS, Endpoint
 from aeroloop.protocol.transport.history import PAGE_BYTES
-from aeroloop.protocol.transport.network_settings import Protected
+from aeroloop.protocol.transport.network_settings import TLS, Endpoint, Protected
 
 THREADS: Final = (
     "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
@@ -30,14 +26,11 @@ THREADS: Final = (
 """Zenoh's threads in a daemon, as ZENOH_RUNTIME: a thread that waits for one slow peer holds up no other."""
 QUEUE: Final = 16  # batches that may wait to be sent on a link, per priority; the most that Zenoh allows
 _QUEUES: Final = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low")
-HEADER_BYTES: Final = 65_536  # more than Zenoh adds to a payload: the key, and what goes with it
+HEADER_BYTES: Final = 65_536  # more than Zenoh adds to a payload
 HANDSHAKE_MS: Final = 2000  # time-out of the handshake with a program that accepts a connection and sends nothing
-LEASE_MS: Final = 1000
-"""A silent peer is disconnected after this [ms]."""
-PATIENT_LEASE_MS: Final = 10_000
-"""The same where frames have a session of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
-LAST: Final = 0xFF
-"""Rank of a session without a port of a rendezvous. Zenoh compares identifiers by their last byte: it is the rank."""
+LEASE_MS: Final = 1000  # a silent peer is disconnected after this [ms]
+PATIENT_LEASE_MS: Final = 10_000  # where frames have a session of their own: at 20 % loss TCP is silent for seconds
+LAST: Final = 0xFF  # rank of a session without a port of a rendezvous; Zenoh compares identifiers by their last byte
 RETRY_MS: Final = (50, 500)  # first and longest pause between two attempts to connect to an endpoint
 
 
@@ -71,15 +64,9 @@ def zenoh_config(
         "open": {"return_conditions": {"connect_scouted": False}},  # otherwise it takes 0.5 s, whatever is linked
         # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
         "low_pass_filter": [
-            {
-                "id": f"{key} {messages[0]}",
-                "flows": ["ingress"],
-                "messages": messages,
-                "key_exprs": [key],
-                "size_limit": most,
-            }
+            {"id": f"{key} {kinds[0]}", "flows": ["ingress"], "messages": kinds, "key_exprs": [key], "size_limit": most}
             for key, answer, request in limits
-            for messages, most in ((["put", "reply"], answer), (["query"], request))
+            for kinds, most in ((["put", "reply"], answer), (["query"], request))
         ],
         "scouting": {
             "multicast": {"enabled": False},
@@ -131,10 +118,10 @@ def router_config(network: Protected) -> dict[str, Any]:
 
 
 def tls_config(certificate: Certificate) -> dict[str, Any]:
-    """Zenoh's configuration at `transport/link/tls`, for links of both directions.
+    """Zenoh's configuration at `transport/link/tls`, for links of both directions; they end with a certificate.
 
-    The links of a peer close when its certificate expires. Zenoh's connecting side trusts the public authorities
-    besides ours; none of them signs a role's common name, so such a link is allowed nothing.
+    Zenoh's connecting side trusts public authorities, too; none of them signs a role's common name, so such a link is
+    allowed nothing.
     """
     file, key = str(certificate.file.absolute()), str(certificate.key.absolute())
     return {
@@ -163,10 +150,9 @@ _MESSAGES: Final[dict[Action, tuple[str, ...]]] = {
 
 
 def access_control(*vehicles: str, loopback: bool = True) -> dict[str, Any]:
-    """Zenoh's `access_control` for a peer or a router.
+    """Zenoh's `access_control` for a peer or a router. Only peers of these `vehicles` have any rights.
 
-    Only peers of these `vehicles` have any rights; every one is named, since Zenoh compares whole common names. If
-    `loopback`, plain links within this host (TCP, UDP, Unix sockets) are unrestricted.
+    If `loopback`, plain links within this host (TCP, UDP, Unix sockets) are unrestricted.
     """
     rules, subjects, policies = [], [], []
     if loopback:

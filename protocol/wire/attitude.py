@@ -1,9 +1,8 @@
 """Attitude conventions, (C.3)–(C.11): one definition for both ends.
 
 A quaternion `q = [η, ε]` is scalar first, multiplies as Hamilton's, and turns body vectors into the inertial frame
-through `R(q)`. Axes: x roll, y pitch, z yaw, z up. Euler angles are roll, pitch, yaw in radians, applied Z–Y–X.
-
-First plain floats, for the loop; then CasADi expressions, for equations. S, T and R are the paper's matrices.
+through `R(q)`. Axes: x roll, y pitch, z yaw, z up. Euler angles are roll, pitch, yaw in radians, applied Z–Y–X. First
+plain floats, for the loop; then CasADi expressions, for equations. S, T and R are the paper's matrices.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from typing import TypeAlias
 
 import casadi as ca
 
-Quaternion: TypeAlias = tuple[float, float, float, float]
-"""[η, ε₁, ε₂, ε₃], unit length."""
+Quaternion: TypeAlias = tuple[float, float, float, float]  # [η, ε₁, ε₂, ε₃], unit length
 
 Vector: TypeAlias = tuple[float, float, float]
 
@@ -32,10 +30,7 @@ def to_euler(q: Quaternion) -> Vector:
 
 
 def sent_vector(q: Quaternion) -> Vector:
-    """ε as it is sent: that of ±q with η ≥ 0.
-
-    q and −q are the same attitude, so the receiver can assume η ≥ 0. η itself is never sent (Remark 1).
-    """
+    """ε as it is sent: that of ±q, one attitude, with η ≥ 0. η itself is never sent (Remark 1)."""
     w, x, y, z = q
     return (x, y, z) if w >= 0 else (-x, -y, -z)
 

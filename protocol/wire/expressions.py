@@ -1,10 +1,6 @@
-"""Quantizers as CasADi expressions, for loops that are compiled as a whole: the codes and levels of the Python classes.
+"""Quantizers as CasADi expressions, for loops that are compiled as a whole.
 
-Each line does the float operations of its twin in `quantizer.py`, in the same order, so that every bit is equal. A
-logarithmic level or edge is computed where its twin looks it up in a table.
-
-CasADi simplifies as it builds: c·(d·x) becomes (c·d)·x, which rounds differently. `as_written` switches that off.
-What it leaves alone: `if_else` adds a 0 to the part that it selects, so that −0.0 becomes 0.0.
+Each line does the float operations of its twin in `quantizer.py`, in the same order, so that every bit is equal.
 """
 
 from __future__ import annotations
@@ -37,10 +33,9 @@ _SWITCH: Final = RLock()
 
 @contextmanager
 def as_written() -> Iterator[None]:
-    """Build expressions and insert functions without simplification, operation by operation.
+    """Build expressions and insert functions operation by operation; c·(d·x) otherwise becomes (c·d)·x, which rounds.
 
-    CasADi has one switch for all threads, so one at a time may build so. What another thread builds meanwhile without
-    asking for it is not simplified either.
+    CasADi has one switch for all threads, so one at a time may build so. `if_else` still turns −0.0 into 0.0.
     """
     with _SWITCH:
         before = ca.GlobalOptions.getSimplificationOnTheFly()
@@ -65,7 +60,7 @@ def with_numbers(quantizer: Quantizer, symbols: ca.SX) -> Quantizer:
 
 
 def level(quantizer: Quantizer, code: ca.SX) -> ca.SX:
-    """The level of a code, as `Quantizer.level`: NaN for `invalid`. Build it `as_written`. Shape (1,)."""
+    """The level of a code, as `Quantizer.level`. Build it `as_written`. Shape (1,)."""
     if isinstance(quantizer, Continuous):
         return code
     assert isinstance(quantizer, CodedQuantizer)

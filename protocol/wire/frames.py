@@ -1,12 +1,9 @@
 """Frames: pack level indices into bytes, unpack them, and find the tick of a received measurement.
 
-Sans-I/O. A frame is a counter and R-bit codes, most significant bit first, with zero bits up to the byte:
+A frame is a counter and R-bit codes, most significant bit first, with zero bits up to the byte:
 
     measurement  counter · ε₁ ε₂ ε₃ : R_ε each · ω₁ ω₂ ω₃ : R_ω each
     command      echo    · u … : R_u each             (echo: the counter of the measurement it answers)
-
-A signal without quantization is sent as big-endian doubles; in a frame that holds any, zero bits fill the counter's
-last byte. A malformed frame is refused whole: `unpack` returns None. Misuse by the caller raises ValueError.
 """
 
 from __future__ import annotations
@@ -22,10 +19,10 @@ MAX_COUNTER_BITS: Final = 16
 
 
 class FrameFormat:
-    """One kind of frame: a counter of 4…16 bits, and a code for each of `widths` [bit]; None is a float64.
+    """One kind of frame: a counter of 4…16 bits, and a code for each of `widths` [bit]; None is a big-endian float64.
 
-    The counter runs 0…`counters` − 1 and wraps. `bits` are those of counter and codes, `first_bit` is the offset of the
-    first code, and `size` the bytes of a frame, padding included.
+    The counter runs 0…`counters` − 1 and wraps. In a frame with floats zero bits fill its last byte. `bits` are those
+    of counter and codes, `first_bit` is the offset of the first code, and `size` the bytes of a frame with padding.
     """
 
     def __init__(self, widths: Sequence[int | None], counter_bits: int) -> None:
@@ -87,19 +84,15 @@ class TickCounter:
 
     The plant's grid is absolute, and frames arrive late, never early, so the earliest arrivals mark the grid. A counter
     stands for the one tick with that counter between 3/4 of the counter's range before the grid's present tick and 1/4
-    after it (4 bits: from 12 ticks before to 3 after). A frame may be that late, and one frame that is assigned to a
-    wrong tick does not affect the next.
-
-    The two clocks drift apart. The mark may therefore move later by 2 % of the elapsed periods: twice the error of a
-    clock that runs 1 % fast, so that the mark follows either clock and still recovers from a mark that is too early. A
-    stream that is late as a whole becomes the grid at the same pace.
+    after it (4 bits: from 12 ticks before to 3 after). One frame that is assigned to a wrong tick does not affect the
+    next. As the two clocks drift apart, the mark may move later by 2 % of the elapsed periods: twice the error of a
+    clock that runs 1 % fast, so that it follows either clock and still recovers from a mark that is too early.
 
     In lockstep no tick is ever skipped, and the counter alone gives the tick. `tick` is that of the last measurement
     that was newer than all before it; −1 at a session's start.
     """
 
-    DRIFT: Final = 50
-    """The mark may move later by one period in this many."""
+    DRIFT: Final = 50  # the mark may move later by one period in this many
 
     def __init__(self, period_ns: int, counters: int, *, lockstep: bool, tick: int = -1) -> None:
         self._period_ns = period_ns

@@ -7,8 +7,8 @@ its level is NaN.
     code   −2^(R−1)   −(2^(R−1) − 1)  …  −1   0   1  …  2^(R−1) − 1
     level  NaN        −y_max          …  −y₁  0   y₁ …  y_max
 
-`UniformQuantizer` is the paper's, `Continuous` its "cont.". Remark 8 names two more kinds and cites another text for
-them; the definitions here are the project's own (SPEC.md, section 2).
+Remark 8 names two more kinds and cites another text for them; the definitions here are the project's own (SPEC.md,
+section 2).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _APART: Final = 2.0**-46  # least relative distance of two edges: more than what
 class Quantizer(ABC):
     """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) requires.
 
-    `level` has no memory; encoding may depend on the last code, so each scalar has a quantizer of its own. `bound` is
-    δ_y of (C.13), `limit` the edge of the range and `outermost` the largest level [signal's unit]; `saturated` counts
-    values beyond the range, and `invalid` is the code of "no valid value".
+    y^Q is `level(encode(y))`; (C.15) applies it to each element of a vector. Encoding may depend on the last code, so
+    each scalar has a quantizer of its own. `bound` is δ_y of (C.13), `limit` the edge of the range and `outermost` the
+    largest level [signal's unit]; `saturated` counts values beyond the range, `invalid` stands for "no valid value".
     """
 
     bound: float
@@ -62,10 +62,6 @@ class Quantizer(ABC):
     def resume(self, code: float) -> None:  # noqa: B027  # the same
         """Restore the memory: this code was the last. `invalid` changes nothing."""
 
-    def quantize(self, y: float) -> float:
-        """y^Q, the level that the quantizer gives y; (C.15) applies it to each element of a vector."""
-        return self.level(self.encode(y))
-
 
 class Continuous(Quantizer):
     """The paper's "cont.": no quantization. The value is its own code; beyond the range, the limit; NaN is invalid."""
@@ -77,7 +73,6 @@ class Continuous(Quantizer):
         self.invalid = nan
 
     def encode(self, y: float) -> float:
-        """See `Quantizer.encode`."""
         if -self.limit <= y <= self.limit:
             return y
         _refuse_nan(y)
@@ -85,7 +80,6 @@ class Continuous(Quantizer):
         return copysign(self.limit, y)
 
     def level(self, code: float) -> float:
-        """See `Quantizer.level`."""
         return float(code)
 
 
@@ -93,8 +87,8 @@ class CodedQuantizer(Quantizer):
     """A quantizer with R-bit codes and a table of levels, symmetric about 0; kinds differ in levels and in `encode`.
 
     `bits` is R, 2…16; `top` is N = 2^(R−1) − 1, the code of the outermost level; `deadzone` is y₀, the largest
-    magnitude that is quantized to 0 by its value alone. Python's negative index is two's complement: `levels[code]`
-    decodes. A parameter out of bounds is a ValueError; all but `bits` have the signal's unit.
+    magnitude that is quantized to 0 by its value alone. `levels[code]` decodes: a negative index is two's complement. A
+    parameter out of bounds is a ValueError; all but `bits` have the signal's unit.
     """
 
     deadzone: float
@@ -115,7 +109,6 @@ class CodedQuantizer(Quantizer):
         self.outermost = self.levels[self.top]
 
     def level(self, code: float) -> float:
-        """See `Quantizer.level`."""
         if not (isinstance(code, int) and self.invalid <= code <= self.top):
             raise ValueError(f"{code!r} is not a code of {self.bits} bits")
         return self.levels[code]
@@ -124,9 +117,8 @@ class CodedQuantizer(Quantizer):
 class UniformQuantizer(CodedQuantizer):
     """The uniform quantizer of (C.14). A tie goes towards zero: intervals are (y_i − l/2, y_i + l/2].
 
-    With y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). The paper gives this l and says only y₀ > 0; l/2 is
-    inferred: with it, 2^R − 1 intervals of that length fill the range exactly. For any other y₀ the step is such that
-    the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1). `step` is l.
+    `step` is l, (limit − y₀) / (2^(R−1) − 1), so that the outermost interval ends at the limit. By default y₀ is l/2:
+    levels are k·l, and l is 2·limit / (2^R − 1) as in the paper, which says only y₀ > 0.
     """
 
     def __init__(self, bits: int, limit: float, deadzone: float | None = None) -> None:
@@ -145,7 +137,6 @@ class UniformQuantizer(CodedQuantizer):
         self._tabulate([self.deadzone + self.step / 2 + i * self.step for i in range(self.top)])
 
     def encode(self, y: float) -> int:
-        """See `Quantizer.encode`."""
         x: float = (abs(y) - self.deadzone) / self.step * TIE
         if x <= 0.0:
             return 0
@@ -159,15 +150,15 @@ class UniformQuantizer(CodedQuantizer):
 class HysteresisQuantizer(UniformQuantizer):
     """The uniform quantizer's levels, and a code that is held while the value stays near its level.
 
-    The held level's interval is widened by h on either side; a value outside it is quantized uniformly. Noise of less
-    than h about an edge therefore changes no code and no frame, and the error bound grows by h. A tie goes to the held
-    level. The last code is the only state.
+    The held level's interval is widened by h on either side, l/2 by default; a value outside it is quantized uniformly.
+    Noise of less than h about an edge therefore changes no code and no frame, and the error bound grows by h. A tie
+    goes to the held level. The last code is the only state.
 
         held level   0                  ±y_i
         stays while  |y| ≤ y₀ + h       y_i − l/2 − h ≤ ±y ≤ y_i + l/2 + h
-
-    With h = l/2, the default, a code changes once the value is more than a step from its level.
     """
+
+    _held: int | None
 
     def __init__(self, bits: int, limit: float, deadzone: float | None = None, hysteresis: float | None = None) -> None:
         super().__init__(bits, limit, deadzone)
@@ -178,35 +169,24 @@ class HysteresisQuantizer(UniformQuantizer):
         self.reset()
 
     def encode(self, y: float) -> int:
-        """See `Quantizer.encode`."""
-        if self._low <= y <= self._high:
-            return self._held
-        code = super().encode(y)
-        self._hold(code)
-        return code
+        if self._held is None or not self._stays(y, self._held):
+            self._held = super().encode(y)
+        return self._held
 
     def reset(self) -> None:
-        """See `Quantizer.reset`."""
-        self._held = 0
-        self._low, self._high = inf, -inf
+        self._held = None
 
     def resume(self, code: float) -> None:
-        """See `Quantizer.resume`."""
         if code != self.invalid:
-            self._hold(int(code))
+            self._held = int(code)
 
-    def _hold(self, code: int) -> None:
+    def _stays(self, y: float, held: int) -> bool:
         # A value within a few units in the last place of an edge lies on it. Beyond the limit a value saturates.
-        h, i = self.hysteresis, abs(code)
-        outer = self.deadzone + i * self.step
+        h, outer = self.hysteresis, self.deadzone + abs(held) * self.step
+        inner = outer - self.step
         high = min(self.limit, outer + h + SLACK * (outer + h))
-        if code:
-            inner = outer - self.step
-            low = inner - h - SLACK * (inner + h)
-        else:
-            low = -high
-        self._held = code
-        self._low, self._high = (-high, -low) if code < 0 else (low, high)
+        low = inner - h - SLACK * (inner + h) if held else -high
+        return low <= (-y if held < 0 else y) <= high
 
 
 class LogarithmicQuantizer(CodedQuantizer):
@@ -245,7 +225,6 @@ class LogarithmicQuantizer(CodedQuantizer):
         self._tabulate([(a + b) / 2 for a, b in pairwise(self.edges)])
 
     def encode(self, y: float) -> int:
-        """See `Quantizer.encode`."""
         _refuse_nan(y)
         i = bisect_left(self.edges, abs(y) * TIE)
         if i > self.top:
@@ -255,15 +234,12 @@ class LogarithmicQuantizer(CodedQuantizer):
 
     def _least_growing(self) -> int:
         """m, by bisection: with a larger m the geometric intervals get shorter and the uniform ones longer."""
-        low, high = 1, self.top - 1
-        while low < high:
-            m = (low + high) // 2
+
+        def serves(m: int) -> bool:
             longest = -self.threshold * expm1(-log(self.threshold / self.deadzone) / m)
-            if longest * _ALIKE <= self._step(m):
-                high = m
-            else:
-                low = m + 1
-        return low
+            return longest * _ALIKE <= self._step(m)
+
+        return 1 + bisect_left(range(1, self.top - 1), True, key=serves)
 
     def _step(self, m: int) -> float:
         return (self.limit - self.threshold) / (self.top - m)

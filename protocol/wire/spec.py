@@ -1,7 +1,6 @@
 """Wire spec and loop settings: what both ends must agree on, and how each end keeps its tick grid.
 
-A signal has a kind of quantizer, bits and a range; a wire has three signals, a number of motors, a counter and a
-transmit policy. Claims, fingerprints, frames, the DBC and log readers derive every scale and width from it.
+Claims, fingerprints, frames, the DBC and log readers derive every scale and width from the wire spec.
 """
 
 from __future__ import annotations
@@ -25,10 +24,8 @@ from aeroloop.protocol.wire.transmit import Transmit
 
 MAX_ACTUATORS: Final = 8
 
-WATCHDOG_S: Final = 0.1
-"""0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
-FIRST_COMMAND_S: Final = 1.0
-"""How long a granted claim may wait for its first command [s]."""
+WATCHDOG_S: Final = 0.1  # 0 V after this long without a fresh command [s], unless configured; as industrial drives do
+FIRST_COMMAND_S: Final = 1.0  # how long a granted claim may wait for its first command [s]
 
 
 class SignalBits(NamedTuple):
@@ -157,10 +154,6 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         """Numbers of the motors, as in u₁: of two they are the paper's 2 and 3, else they begin at 1."""
         return range(2, 4) if self.actuators == 2 else range(1, self.actuators + 1)
 
-    def freshness_ns(self, period_ns: int) -> int:
-        """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns]."""
-        return period_ns << self.counter_bits
-
     def with_bits(self, text: str) -> WireSpec:
         """The same spec with other bits, as of `SignalBits.parse`. Raises ValueError."""
         signals = {name: getattr(self, name).with_bits(bits) for name, bits in SignalBits.parse(text)._asdict().items()}
@@ -201,11 +194,9 @@ class LoopSettings(BaseModel, extra="forbid"):
     lockstep: bool = Field(
         default=False, description="the plant waits for each command before it steps: repeatable, as fast as possible"
     )
-
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
-        description="request SCHED_FIFO, locked memory, affinity, CPUs that stay awake; strict: refuse to run without "
-        "the first three; off: request none",
+        description="request SCHED_FIFO, locked memory, affinity, awake CPUs; strict: stop without the first three",
     )
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
 

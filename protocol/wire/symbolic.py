@@ -1,9 +1,4 @@
-"""Evaluation of a `casadi.Function` in preallocated memory.
-
-CasADi writes the equations; the loop evaluates them. A call of a Function with arguments costs 160 µs, most of it for
-making and checking matrices. Through `Function.buffer()` it reads and writes preallocated memory, and costs about 1 µs.
-`Compiled` keeps that memory and names it; two functions may share a buffer: one's output is the next one's input.
-"""
+"""Evaluation of a `casadi.Function` in preallocated memory: 1 µs, where a call with arguments takes 160 µs."""
 
 from __future__ import annotations
 
@@ -14,8 +9,7 @@ from typing import TypeAlias
 
 import casadi as ca
 
-Buffer: TypeAlias = "memoryview[float]"
-"""A row of doubles, written and read by index. Matrices are in CasADi's order, column by column."""
+Buffer: TypeAlias = "memoryview[float]"  # a row of doubles, written and read by index; matrices column by column
 
 
 def buffer(size: int) -> Buffer:
@@ -32,9 +26,9 @@ def parts(memory: Buffer, sizes: Mapping[str, int]) -> dict[str, Buffer]:
 class Compiled:
     """A function whose named inputs and outputs are rows of doubles in memory.
 
-    Write into `inputs[name]`, call `evaluate`, read `outputs[name]`. Nothing is allocated by a call. All inputs and
-    outputs must be dense and named; `shared` are buffers to use instead of new ones, by name. `evaluate` does not keep
-    the object alive, whose memory it uses.
+    Write into `inputs[name]`, call `evaluate`, read `outputs[name]`. All inputs and outputs must be dense and named.
+    `shared` are buffers to use instead of new ones, by name: one function's output may be the next one's input.
+    `evaluate` does not keep the object alive, whose memory it uses.
 
     Raises:
         ValueError: A shared buffer differs in size from its input or output.

@@ -43,7 +43,7 @@ class Transmit(BaseModel, frozen=True, extra="forbid"):
 class Sender:
     """Decides, tick by tick, whether a frame is to be sent.
 
-    `heartbeat` is the most ticks from one frame to the next, `counters` the number of values of the frames' counter.
+    `heartbeat` is the most ticks between two frames, `counters` the number of values of the frames' counter.
     """
 
     def __init__(self, policy: Policy, heartbeat: int, counters: int) -> None:
@@ -63,8 +63,8 @@ class Sender:
         since = None if self._at is None else k - self._at
         if since is not None and since < self._heartbeat and self._codes is not None and _same(codes, self._codes):
             return False
-        # After missed ticks its counter may equal the last frame's, and the receiver take it for a repetition of that
-        # one: then the next tick's frame is due as well.
+        # After missed ticks its counter may equal the last frame's, of which the receiver takes it for a repetition:
+        # then the next tick's frame is due as well.
         self._codes = None if since is not None and since % self._counters == 0 else codes
         self._at = k
         return True

@@ -154,7 +154,7 @@ def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
     """Check where a figure is to be drawn, if one is. Raises as `check_path` and `check_output` do."""
     if figure is not None:
         from aeroloop.service.logs.outputs import check_output
-        from aeroloop.service.report.figure_style import check_path
+        from aeroloop.service.report.plots import check_path
 
         check_path(figure)
         check_output(figure, [config], force=force)

@@ -148,7 +148,7 @@ def laws(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out. "
+            help="A kind of law: ours, or package.module:Class; may be repeated; ours if left out. "
             "One that adapts is shown without adaptation, too.",
         ),
     ] = None,

@@ -113,7 +113,7 @@ def compare(
         limits = [Limit.parse(text) for text in require or []]
     _check_page(html, logs, force)
 
-    from aeroloop.service.review.compare import Comparison, read_runs
+    from aeroloop.service.review.review import Comparison, read_runs
     from aeroloop.service.terminal.display import progress_bar
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 

@@ -1,11 +1,8 @@
 """Controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
 
 Daemon, lockstep experiment, review of a log and tests all run this one code path. The law's time is k times the
-period. A frame that would repeat the last levels need not be sent; the controller then receives UNCHANGED and computes
-with the levels it holds.
-
-Between the codes of the one frame and those of the other stands one CasADi function, `tick_function`. Its outputs are
-one row of doubles. After a valid tick the row is copied; the copy is what the next tick continues from.
+period. Between the codes of the one frame and those of the other stands one CasADi function, `tick_function`. Its
+outputs are one row of doubles. After a valid tick the row is copied; the copy is what the next tick continues from.
 """
 
 from __future__ import annotations
@@ -26,42 +23,34 @@ from aeroloop.protocol.wire.expressions import as_written, encode, level, satura
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, parts
 from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
-from aeroloop.service.control.laws.evaluation import (
+from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
+from aeroloop.service.control.laws.registry import (
     check_answer,
     configured_gains,
     initial_state,
     law_function,
+    law_of,
+    no_number,
+    words_of,
 )
-from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
-from aeroloop.service.control.laws.registry import law_of, no_number, words_of
 from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import reference_function
 
 Codes = tuple[float, ...]
 
-_OF_MEASUREMENT: Final = ("q", "state_next", "q_d", "omega", "eps_e", "omega_e")
-"""Outputs that are kept of every measurement with valid values; the others only if u is a number."""
-
-# ── one tick as one function ──
+_OF_MEASUREMENT: Final = 6  # of its outputs are kept of every measurement with valid values; all only if u is a number
 
 
 def tick_function(wire: WireSpec, law: Law[Any]) -> ca.Function:
     """One tick: codes of a measurement in, codes of the command out. Raises LawError as `law_function`.
 
-    The parts are inserted as they are written, so every bit is that of the parts evaluated one after the other.
-
-    Inputs:
-        codes: Of the measurement. Shape (6,).
-        t, start, quintic, amplitude, frequency: Time, and the reference's piece, as for `reference_function`.
-        gains, last, state: As for `law_function`; of a law in Python also law_voltages and law_state.
-        held: Codes of the last valid command; NaN before the first. Shape (actuators,).
-        saturated: Voltages beyond the range so far.
+    Inputs are those of `reference_function` and `law_function`; the codes of the measurement, shape (6,); `held`, those
+    of the last valid command, NaN before the first, shape (actuators,); and how many voltages were `saturated` so far.
 
     Outputs:
-        q, state_next: State for the next tick.
+        q, state_next, saturated_next: State for the next tick.
         q_d, omega, eps_e, omega_e: Desired attitude, rate as received, errors.
         u, command: Voltages before quantization [V], and their codes. Shapes (actuators,).
-        saturated_next: The count for the next tick.
         measured: 1 if each code of the measurement has a level. If 0, no output above counts.
         computed: 1 if u is a number, too. If 0, u, command and saturated_next do not count.
         eta_e, omega_d, omega_d_dot: The rest of what a law in Python computes from.
@@ -109,40 +98,28 @@ def _expressions_function(wire: WireSpec, law: type[ExpressionLaw[Any]], setting
     return tick_function(wire, law(law.Settings.model_validate_json(settings), period, wire.actuators))
 
 
-# ── the controller ──
-
-
 def _last(name: str) -> Any:
-    """A property of the controller: an output at the last valid tick."""
+    """A property of the controller: an output of `tick_function` at the last valid tick."""
     return property(lambda self: tuple(self.last_valid[name]))
 
 
 class ControllerSnapshot(BaseModel):
-    """State carried from tick to tick, besides reference and gains. Its JSON keeps every bit of the floats.
-
-    Attributes:
-        attitude: q^Q of the last measurement [1].
-        law: The law's named state.
-        held: Codes of the last measurement, for silence; None before the first. Shape (6,).
-        voltage_codes: Those of the last valid voltages, for quantizers with a memory; None before the first.
-        sent_codes: Those of the last command sent; None where the next one is sent in any case.
-        sent_tick: Its tick.
-    """
+    """State carried from tick to tick, besides reference and gains. Its JSON keeps every bit of the floats."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
-    attitude: Quaternion = IDENTITY
-    law: dict[str, tuple[float, ...]]
-    held: Codes | None = None
-    voltage_codes: Codes | None = None
-    sent_codes: Codes | None = None
+    attitude: Quaternion = IDENTITY  # q^Q of the last measurement [1]
+    law: dict[str, tuple[float, ...]]  # named state
+    held: Codes | None = None  # of the last measurement, for silence; None before the first
+    voltage_codes: Codes | None = None  # of the last valid voltages, for quantizers with a memory
+    sent_codes: Codes | None = None  # of the last command sent; None where the next one is sent in any case
     sent_tick: int | None = None
 
 
 class Controller:
     """The law between a measurement frame and a command frame.
 
-    It follows the reference from tick 0 on; `period` is the time between ticks [s].
+    It follows the reference from tick 0 on; `period` is the time between ticks [s]. Raises as `law_of`.
 
     Attributes:
         tick_index: k of the last measurement answered, −1 before the first; `counter` is that measurement's.
@@ -151,28 +128,16 @@ class Controller:
         fault: Why the law gave no voltages, once it has not; None before.
         outputs: What the last tick computed, by name as of `tick_function`; `row` has them one beside the other.
         last_valid: The same of the last valid tick.
-
-    Raises:
-        LawError: The law cannot be used, such as one for another number of actuators.
-        PluginError: There is no such law.
     """
 
     attitude: Quaternion = _last("q")
-    """q^Q of the last measurement [1]."""
-    rate: Vector = _last("omega")
-    """ω^Q of the last measurement, body frame [rad/s]."""
     desired: Quaternion = _last("q_d")
-    """q_d at the last measurement [1]."""
     attitude_error: Vector = _last("eps_e")
-    """ε̃ at the last measurement [1]."""
     rate_error: Vector = _last("omega_e")
-    """ω_e at the last measurement, body frame [rad/s]."""
     voltages: tuple[float, ...] = _last("u")
-    """The last u before quantization [V]. Shape (actuators,)."""
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
-        self.wire = wire
-        self.period = period
+        self.wire, self.period = wire, period
         self.tick_index, self.counter, self.refused, self.invalid = -1, 0, 0, 0
         self.fault: str | None = None
         self.law = law_of(law, period, wire.actuators)
@@ -186,6 +151,7 @@ class Controller:
         sizes = {name: function.numel_out(name) for name in function.name_out()}
         self.row, self._last_row = buffer(sum(sizes.values())), buffer(sum(sizes.values()))
         self.outputs, self.last_valid = parts(self.row, sizes), parts(self._last_row, sizes)
+        self._of_measurement = slice(sum([*sizes.values()][:_OF_MEASUREMENT]))
         last = self.last_valid
         carried = {"last": last["q"], "state": last["state_next"], "held": last["command"]}
         memory = self.outputs | carried | {"saturated": last["saturated_next"]}
@@ -212,9 +178,8 @@ class Controller:
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Answer the measurement of tick k: a frame, UNCHANGED if its levels have not changed, or None for none.
 
-        Returns:
-            The command frame; UNCHANGED if it would repeat the last one; None for no measurement and malformed bytes.
-            A measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
+        Returns the command frame; UNCHANGED if it would repeat the last one; None for none and for malformed bytes. A
+        measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
         """
         if frame is None:
             return None
@@ -241,8 +206,7 @@ class Controller:
             command = [*map(self._as_codes, self.outputs["command"])]
         elif self._measured[0]:
             self.fault = self.fault or no_number(self.law)
-            for name in _OF_MEASUREMENT:
-                self.last_valid[name][:] = self.outputs[name]
+            self._last_row[self._of_measurement] = self.row[self._of_measurement]
         else:
             self.invalid += 1
         return self._write(counter, command) if self._sender.due(k, command) else UNCHANGED

@@ -3,10 +3,8 @@
 However often the reference changes, its angle, rate and acceleration never jump. In an approach each axis brakes to
 rest, then all of them turn along a straight line of roll, pitch and yaw, from rest to rest, and each runs up to the
 rate of the reference that is reached; the run-up is a braking seen backwards. So no axis goes further beyond its start
-or its target than it takes to stop there. The time given changes the speed of the turn and nothing else: more time
-never makes an approach less possible, and the shortest time is known without a search.
-
-A set-point of a stream is reached by a single quintic, which need not stop, where that swings out no further.
+or its target than it takes to stop there, and the time given changes the speed of the turn and nothing else. A
+set-point of a stream is reached by a single quintic, which need not stop, where that swings out no further.
 """
 
 from __future__ import annotations
@@ -36,35 +34,21 @@ BRAKING: Final = 1.0
 START_WITHIN_DEG: Final = 20.0
 """A session that begins further than this from its reference first approaches it smoothly [deg]; from nearer the law
 gets there before a motor has been at its limit for the second after which the Aero trips."""
-LEAST_TURN_S: Final = 0.02
-"""Least time of the turn [s], however small it is."""
-LET_GO_S: Final = 0.1
-"""Least time in which an acceleration is reduced to 0 [s]: 50 ticks at 500 Hz, where a jump would be a step of torque;
-from rest it moves an axis by a 1200th of the acceleration meanwhile, which is 0.05° for each rad/s²."""
-_HARDER: Final = 6
-"""How often the time of a braking is halved at the most, where it would otherwise leave the limits."""
-_SLOWER: Final = 1.05
-_TRIES: Final = 8
-_SLACK: Final = 1 + 1e-9
-"""Rounding of what is compared with a limit."""
+LEAST_TURN_S: Final = 0.02  # least time of the turn [s], however small it is
+LET_GO_S: Final = 0.1  # least time in which an acceleration is reduced to 0 [s]: a jump would be a step of torque
+_HARDER: Final = 6  # how often the time of a braking is halved at the most
+_SLOWER, _TRIES = 1.05, 8  # of a quintic to a set-point
+_SLACK: Final = 1 + 1e-9  # rounding of what is compared with a limit
 
 
 class Approach(NamedTuple):
-    """Times of an approach, as in the trace's changes. The default is a jump.
+    """Times of an approach, as in the trace's changes. The default is a jump."""
 
-    Attributes:
-        within_s: All of it [s].
-        start: Roll, pitch, yaw to begin from, at rest, instead of the present reference [deg].
-        brake_s: Time in which roll, pitch, yaw each brake to rest at its start; None for a single quintic [s].
-        run_up_s: Time in which each runs up to the rate of the target at its end [s].
-        here: Roll, pitch, yaw to begin from [rad], their rates [rad/s] and accelerations [rad/s²]; None with `start`.
-    """
-
-    within_s: float = 0.0
-    start: Vector | None = None
-    brake_s: Vector | None = None
-    run_up_s: Vector | None = None
-    here: tuple[Vector, Vector, Vector] | None = None
+    within_s: float = 0.0  # all of it [s]
+    start: Vector | None = None  # roll, pitch, yaw to begin from, at rest, instead of the present reference [deg]
+    brake_s: Vector | None = None  # in which roll, pitch, yaw each brake to rest; None for a single quintic [s]
+    run_up_s: Vector | None = None  # in which each runs up to the rate of the target at its end [s]
+    here: tuple[Vector, Vector, Vector] | None = None  # angles [rad], rates and accelerations to begin from
 
     def at_least(self, within_s: float) -> Approach:
         """This shortest approach, extended to `within_s` if that is longer."""
@@ -80,21 +64,6 @@ class Approach(NamedTuple):
             f"the approach is too short: with controller.max_reference_rate = {limits.rate:g} rad/s it takes longer "
             f"than {within_s:g} s; {remedy}"
         )
-
-
-JUMP: Final = Approach()
-
-
-def at_rest(angle: Floats) -> Angles:
-    """The state of a body at rest [rad]. Shape (…, 3)."""
-    return Angles(angle, np.zeros_like(angle), np.zeros_like(angle))
-
-
-def nearest_turn(attitude: Vector, target: Trajectory) -> Vector:
-    """The same attitude, each angle within half a turn of the first of the target [deg]: −10° is 350°."""
-    first = np.degrees(target.first.angle[0])
-    roll, pitch, yaw = (a + 360.0 * round((f - a) / 360.0) for a, f in zip(attitude, first.tolist(), strict=True))
-    return roll, pitch, yaw
 
 
 def braked(state: Angles, brake_s: Floats, s: Floats) -> Angles:
@@ -132,12 +101,6 @@ def braking_times(state: Angles, limits: Limits) -> Floats:
     return times
 
 
-def stopping_distances(state: Angles, brake_s: Floats) -> Floats:
-    """How far each axis turns, at most, while it brakes [rad]. Shape (3,)."""
-    distances: Floats = np.abs(state.rate[0]) * brake_s / 2 + np.abs(state.acceleration[0]) * brake_s**2 / 12
-    return distances
-
-
 def _backwards(state: Angles) -> Angles:
     return Angles(state.angle, -state.rate, state.acceleration)
 
@@ -167,9 +130,17 @@ def shortest(target: Trajectory, here: Angles, limits: Limits) -> Approach:
     return Approach(within_s, None, tuple(brake_s.tolist()), tuple(run_up_s.tolist()), here.row)
 
 
-def shortest_from_rest(target: Trajectory, start: Vector, limits: Limits) -> Approach:
-    """The shortest approach from roll, pitch, yaw at which a body is found [deg]. Raises FollowError."""
-    return shortest(target, at_rest(np.radians(np.array([start]))), limits)._replace(start=start, here=None)
+def at_rest(attitude: Vector) -> Angles:
+    """The state of a body at rest at roll, pitch, yaw [deg]. Shapes (1, 3)."""
+    return Angles(np.radians([attitude]), np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def shortest_from_rest(target: Trajectory, found: Vector, limits: Limits) -> Approach:
+    """The shortest approach from roll, pitch, yaw at which a body is found [deg], −10° or 350°. Raises FollowError."""
+    turns = np.round((np.degrees(target.first.angle[0]) - found) / 360.0)
+    roll, pitch, yaw = (np.array(found) + 360.0 * turns).tolist()
+    start = roll, pitch, yaw
+    return shortest(target, at_rest(start), limits)._replace(start=start, here=None)
 
 
 def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limits) -> Approach:
@@ -180,7 +151,8 @@ def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limi
     """
     brake_s = np.maximum(braking_times(here, limits), within_s)
     ends = np.concatenate([here.angle, target.first.angle])
-    margin = stopping_distances(here, brake_s) + 1e-9  # rounding of what is hardly moving
+    stops_within = np.abs(here.rate[0]) * brake_s / 2 + np.abs(here.acceleration[0]) * brake_s**2 / 12
+    margin = stops_within + 1e-9  # rounding of what is hardly moving
     low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
     candidate = within_s
     for _ in range(_TRIES):
@@ -201,7 +173,7 @@ def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -
     """
     within_s, start, brake, run_up, begin = approach
     if start is not None:
-        here = at_rest(np.radians(np.array([start])))
+        here = at_rest(start)
     elif begin is not None:
         here = Angles(*(np.array([row]) for row in begin))
     there = target.first
@@ -219,14 +191,10 @@ def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -
     return target.after(t + s, np.diff(s), knots)
 
 
-# ── the reference as followed ──
-
-
 class Motion:
     """The reference as the loop evaluates it, tick by tick, from t = 0 on, and `trajectory`, which is followed now.
 
-    `shared` is memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
-    function with the same inputs, which then evaluates the reference at the time last set.
+    `shared` is memory to use instead of its own, by name: that of a function with the inputs of `reference_function`.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
@@ -248,7 +216,7 @@ class Motion:
         q_d, omega_d, omega_d_dot = map(list, self._function.outputs.values())
         return q_d, omega_d, omega_d_dot
 
-    def follow(self, target: Trajectory, t: float, approach: Approach = JUMP) -> None:
+    def follow(self, target: Trajectory, t: float, approach: Approach) -> None:
         """Follow another trajectory from time t [s] on, by an approach; its own time begins when it is reached."""
         self.trajectory = trajectory = approached(target, self.here(t), t, approach)
         self._load(trajectory.piece(t))

@@ -30,17 +30,12 @@ Floats = NDArray[np.float64]
 POWERS: Final = 6
 SAMPLES: Final = 65
 """Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
-_CELLS: Final = {1: 512, 2: 96, 3: 36}
-"""Cells of each free phase to begin with, by the number of free phases."""
+_CELLS: Final = {1: 512, 2: 96, 3: 36}  # of each free phase to begin with, by the number of free phases
 _MOST_CELLS: Final = 100_000
-_TOLERANCE: Final = 1e-7
-"""A supremum over phases is at most this share above the largest value found, unless that takes too many cells."""
-_ROUNDED: Final = 1e-12
-"""A value's share by which it may be rounded."""
-_LIMIT_SLACK: Final = 1 + 1e-6
-"""So much may exceed a limit: a reference that just reaches it is within it."""
-_COMMON: Final = 16
-"""Axes are locked to each other if the ratio of their frequencies has integers up to this."""
+_TOLERANCE: Final = 1e-7  # share by which a supremum may exceed the largest value found, unless that takes more cells
+_ROUNDED: Final = 1e-12  # share by which a value may be rounded
+_LIMIT_SLACK: Final = 1 + 1e-6  # a reference that just reaches a limit is within it
+_COMMON: Final = 16  # axes are locked to each other if the ratio of their frequencies has integers up to this
 
 
 class FollowError(AeroloopError):
@@ -48,17 +43,11 @@ class FollowError(AeroloopError):
 
 
 class Limits(NamedTuple):
-    """Limits of a reference.
+    """Limits of a reference."""
 
-    Attributes:
-        rate: Largest angular velocity [rad/s].
-        tilt: Largest angle between the body's z axis and the vertical [rad].
-        rolls: Whether the vehicle can roll; a 2-DOF bench cannot.
-    """
-
-    rate: float
-    tilt: float
-    rolls: bool
+    rate: float  # largest angular velocity [rad/s]
+    tilt: float  # largest angle between the body's z axis and the vertical [rad]
+    rolls: bool  # whether the vehicle can roll; a 2-DOF bench cannot
 
 
 class Angles(NamedTuple):
@@ -78,29 +67,20 @@ class Angles(NamedTuple):
         """Angular velocities [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ. Shape (n,)."""
         square = (self.rate**2).sum(axis=1)
         square -= 2 * self.rate[:, 0] * self.rate[:, 2] * np.sin(self.angle[:, 1])
-        speeds: Floats = np.sqrt(np.maximum(0.0, square))  # NaN stays NaN
-        return speeds
+        return np.asarray(np.sqrt(np.maximum(0.0, square)))  # NaN stays NaN
 
     def tilts(self) -> Floats:
         """Angles between the body's z axis and the vertical [rad]. Shape (n,)."""
-        tilts: Floats = np.arccos(np.clip(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1]), -1.0, 1.0))
-        return tilts
+        return np.asarray(np.arccos(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1])))
 
 
 class Trajectory(NamedTuple):
-    """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends.
+    """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends."""
 
-    Attributes:
-        starts: Start time of each [s], increasing. Shape (n,).
-        quintic: c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3).
-        amplitude: Of roll, pitch, yaw [rad]. Shape (n, 3).
-        frequency: Of roll, pitch, yaw [rad/s]. Shape (n, 3).
-    """
-
-    starts: Floats
-    quintic: Floats
-    amplitude: Floats
-    frequency: Floats
+    starts: Floats  # of each [s], increasing. Shape (n,)
+    quintic: Floats  # c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3)
+    amplitude: Floats  # of roll, pitch, yaw [rad]. Shape (n, 3)
+    frequency: Floats  # of roll, pitch, yaw [rad/s]. Shape (n, 3)
 
     @classmethod
     def of(cls, reference: Reference) -> Trajectory:
@@ -184,19 +164,17 @@ class Trajectory(NamedTuple):
         jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2).reshape(-1, 3)
         swing, f = np.abs(self.amplitude[-1]) * (self.frequency[-1] > 0), self.frequency[-1]
         largest = [np.abs(part).max(axis=0) for part in (*self.samples(), jerk)]
-        peaks: Floats = np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3])
-        return peaks
+        return np.asarray(np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3]))
 
     def largest(self, value: Callable[[Angles], Floats], terms: Floats) -> float:
         """The largest of a value of the angles: of the quintics' samples, and over all phases of the sinusoid.
 
-        Axes whose frequencies have a ratio of small integers are locked to each other. All others come, in the long
-        run, as near as one likes to every combination of phases; so a grid covers these, and each cell that may hold
-        the maximum is halved along each phase until the allowance for what lies between is small. It is derived: the
-        value is ‖v‖, v a sum of products of factors φ of one axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K.
-        Along the line from the maximum to the centre of its cell, up to d away in each phase, a product's second
-        derivative is at most (d Σn)² ΠK. As ‖v‖' = 0 at the maximum, the value at that centre is less by no more than
-        half the sum of these. `terms` has a row a product: its size ΠK, and Σn for the phases of roll, pitch and yaw.
+        Axes whose frequencies have a ratio of small integers are locked to each other; all others come as near as one
+        likes to every combination of phases. A grid covers these, and each cell that may hold the maximum is halved
+        until the allowance for what lies between is small: the value is ‖v‖, v a sum of products of factors φ of one
+        axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K. From the maximum to the centre of its cell, up to d away
+        in each phase, a product's second derivative is at most (d Σn)² ΠK, and ‖v‖' = 0 at the maximum. `terms` has a
+        row a product: its size ΠK, and Σn for the phases of roll, pitch and yaw.
         """
         most = float(value(self.samples()).max())
         sizes, degrees = terms[:, 0], terms[:, 1:]
@@ -226,9 +204,8 @@ class Trajectory(NamedTuple):
     def fastest(self) -> float:
         """The largest angular velocity [rad/s]."""
         angle, (roll, pitch, yaw), *_ = self.peaks()
-        return self.largest(
-            Angles.speeds, np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
-        )
+        terms = np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
+        return self.largest(Angles.speeds, terms)
 
     def check(self, limits: Limits) -> None:
         """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
@@ -252,8 +229,7 @@ class Trajectory(NamedTuple):
 
 def turning(amplitude: Floats) -> Floats:
     """The degree n of cos and sin of A sin x as factors of x, in `Trajectory.largest`. Shape as given."""
-    degree: Floats = np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25))
-    return degree
+    return np.asarray(np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25)))
 
 
 def _locked(amplitude: Floats, frequency: Floats) -> Floats:
@@ -278,17 +254,10 @@ def join(here: Angles, there: Angles, length: Floats) -> Floats:
     angle = there.angle - (p + v * T + a * T * T / 2)
     rate = (there.rate - (v + a * T)) * T
     acceleration = (there.acceleration - a) * T * T
-    return np.stack(
-        [
-            p,
-            v,
-            a / 2,
-            (10 * angle - 4 * rate + acceleration / 2) / T**3,
-            (-15 * angle + 7 * rate - acceleration) / T**4,
-            (6 * angle - 3 * rate + acceleration / 2) / T**5,
-        ],
-        axis=1,
-    )
+    third = (10 * angle - 4 * rate + acceleration / 2) / T**3
+    fourth = (-15 * angle + 7 * rate - acceleration) / T**4
+    fifth = (6 * angle - 3 * rate + acceleration / 2) / T**5
+    return np.stack([p, v, a / 2, third, fourth, fifth], axis=1)
 
 
 @cache
@@ -307,14 +276,10 @@ def reference_function() -> ca.Function:
     q_d_dot = ca.jacobian(q_d, t)
     omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
     omega_d_dot = ca.jacobian(omega_d, t)
-    return ca.Function(
-        "reference",
-        [t, start, quintic, amplitude, frequency],
-        [q_d, omega_d, omega_d_dot],
-        ["t", "start", "quintic", "amplitude", "frequency"],
-        ["q_d", "omega_d", "omega_d_dot"],
-        {"cse": True},  # the derivatives repeat sines and cosines: 12 instead of 36, and the same numbers
-    )
+    inputs = {"t": t, "start": start, "quintic": quintic, "amplitude": amplitude, "frequency": frequency}
+    outputs = {"q_d": q_d, "omega_d": omega_d, "omega_d_dot": omega_d_dot}
+    # The derivatives repeat sines and cosines: with "cse" 12 instead of 36, and the same numbers.
+    return ca.Function("reference", [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True})
 
 
 def desired(reference: Reference, period: float, ticks: int) -> Floats:

@@ -26,34 +26,23 @@ class SessionLostError(AeroloopError):
 
 
 class ClaimClient:
-    """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it.
-
-    Attributes:
-        session: The granted session, or None.
-        last: Record of the vehicle's last session, from the last grant; None if the plant has none.
-        refusal: Why the plant refused the last claim; empty if it did not.
-        by_datagrams: Whether the last claim's frames travel as datagrams.
-    """
+    """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it."""
 
     def __init__(self, role: Node, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
         self._role, self._loop, self._wire, self._auto_arm = role, loop, wire, auto_arm
-        self.refusal = ""
-        self.session: str | None = None
-        self.last: SessionRecord | None = None
-        self.by_datagrams = False
+        self.refusal = ""  # why the plant refused the last claim; empty if it did not
+        self.session: str | None = None  # the granted one
+        self.last: SessionRecord | None = None  # of the vehicle's last session, from the last grant
+        self.by_datagrams = False  # whether the last claim's frames travel as datagrams
         self._kept: SessionRecord | None = None  # the last record that the plant has confirmed
 
     def claim(self) -> ZenohLink | None:
         """Claim the vehicle. The link is opened before the query, so that the first measurement is not lost."""
         role = self._role
         claim = Claim(
-            controller=role.name,
-            session=uuid.uuid4().hex[:8],
-            period_ns=self._loop.period_ns,
-            lockstep=self._loop.lockstep,
-            auto_arm=self._auto_arm,
-            wire=self._wire,
-        )
+            controller=role.name, session=uuid.uuid4().hex[:8], period_ns=self._loop.period_ns,
+            lockstep=self._loop.lockstep, auto_arm=self._auto_arm, wire=self._wire,
+        )  # fmt: skip
         carrier = self._carrier()
         if carrier is None:
             return None
@@ -87,24 +76,17 @@ class ClaimClient:
                 if reply.ok and Answer.decode(reply.ok.payload.to_bytes()).done:
                     self._kept = record
 
-        self._role.zenoh.get(
-            topics.key("record", self._role.vehicle),
-            answered,
-            payload=record.encode(),
-            timeout=ANSWER_WAIT_S,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        drop, key = zenoh.CongestionControl.DROP, topics.key("record", self._role.vehicle)
+        self._role.zenoh.get(key, answered, payload=record.encode(), timeout=ANSWER_WAIT_S, congestion_control=drop)
 
     def release(self) -> None:
         """Release the session, whether or not the plant still answers."""
         if self.session is None:
             return
         role, session, self.session = self._role, self.session, None
+        payload = Release(session=session).encode()
         try:
-            for _ in role.zenoh.get(
-                topics.key("release", role.vehicle), payload=Release(session=session).encode(), timeout=ANSWER_WAIT_S
-            ):
-                pass
+            list(role.zenoh.get(topics.key("release", role.vehicle), payload=payload, timeout=ANSWER_WAIT_S))
         except zenoh.ZError as error:  # an event that is not published: Zenoh has just failed
             text = f"could not release the session: {error}"
             log_event(Event(role=role.role, kind="fault", text=text, session=session), role.vehicle)
@@ -118,14 +100,13 @@ class ClaimClient:
             return datagrams.session
         for reply in role.zenoh.get(topics.key("status", role.vehicle, role="plant"), timeout=ANSWER_WAIT_S):
             with suppress(MessageError):
-                if reply.ok is None or not (
-                    endpoint := Status.decode(reply.ok.payload.to_bytes(), extra="ignore").datagrams
-                ):
+                status = Status.decode(reply.ok.payload.to_bytes(), extra="ignore") if reply.ok else None
+                if status is None or not status.datagrams:
                     return role.zenoh
-                linked = datagrams.connect(endpoint)
+                linked = datagrams.connect(status.datagrams)
                 if linked is not False:
                     return datagrams.session if linked else None
-                place = endpoint.partition("?")[0]
+                place = status.datagrams.partition("?")[0]
                 text = f"no datagrams pass to {place}: frames go by TCP, where each lost packet delays them"
                 role.warn("datagrams", "fault", text)
                 return role.zenoh

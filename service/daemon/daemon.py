@@ -26,17 +26,10 @@ CLAIM_PERIOD_S: Final = 0.25
 
 
 class Daemon:
-    """The controller end as a process. The role's name must be unique: the plant identifies its holder by it.
-
-    Raises:
-        LawError: The law cannot be used.
-        PluginError: There is no such law.
-    """
+    """The controller end as a process. Raises as `law_of`."""
 
     def __init__(self, role: Node, settings: Settings) -> None:
-        self._role = role
-        self._clock = role.clock
-        self._settings = settings
+        self._role, self._clock, self._settings = role, role.clock, settings
         self._next: Controller | None = self._new_controller()  # of the next session
         self._session: Session | None = None
         self._shared = Shared(role, settings, self._why_none)
@@ -143,33 +136,17 @@ class Daemon:
         record, state = shared.changes.record, shared.machine.state
         self._shown = state, record
         self._shared.claims.keep(record)
-        shared.age.turn_when_due()
-        refused = counts.refused + shared.changes.setpoints.refused + (session.refused if session else 0)
-        self._role.status(
-            Status(
-                role=self._role.role,
-                state=state,
-                session=self._shared.claims.session,
-                cause=shared.cause if state is State.FAULTED else None,
-                uptime_s=self._role.uptime_s,
-                ticks=counts.ticks,
-                rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
-                skipped=counts.skipped,
-                received=counts.received,
-                sent=counts.sent,
-                refused=refused,
-                stale=counts.stale,
-                saturated=counts.saturated + (session.controller.saturated if session else 0),
-                age_us=shared.age.recent().summary(),
-                timing=shared.timing.report() if shared.timing else None,
-                notes=self._notes,
-                lacks_recorder=self._lacks_recorder(),
-                gains=record.gains,
-                gains_from=record.gains_from,
-                reference=in_words(record.reference),
-                reference_from=record.reference_from,
-            )
-        )
+        refused = counts.refused + shared.changes.refused + (session.refused if session else 0)
+        self._role.status(Status(
+            role=self._role.role, state=state, session=shared.claims.session,
+            cause=shared.cause if state is State.FAULTED else None, uptime_s=self._role.uptime_s,
+            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
+            skipped=counts.skipped, received=counts.received, sent=counts.sent, refused=refused, stale=counts.stale,
+            saturated=counts.saturated + (session.controller.saturated if session else 0),
+            age_us=shared.age.recent(), timing=shared.timing.report() if shared.timing else None,
+            notes=self._notes, lacks_recorder=self._lacks_recorder(), gains=record.gains, gains_from=record.gains_from,
+            reference=in_words(record.reference), reference_from=record.reference_from,
+        ))  # fmt: skip
         self._status_ticks, self._status_time_s = counts.ticks, now
         self._status_due_s = self._clock.monotonic() + STATUS_PERIOD_S
 

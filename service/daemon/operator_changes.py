@@ -1,9 +1,8 @@
-"""Operator changes: gains and reference of the running controller, and what sets them.
+"""Operator changes: gains and reference of the running controller, by request, by a stream, and at a session's start.
 
-That is an operator's request, a stream's set-point or the start of a session. A request is checked in a thread beside
-the loop, which takes time; what touches the controller runs in the loop, between two ticks. Every change is in the
-trace with the tick from which it holds, so that a log can be computed again. `controller.after_restart` decides what a
-session begins with; the plant gets a record of both, for the controller after this one.
+A request is checked in a thread beside the loop; what touches the controller runs in the loop, between two ticks. Every
+change is in the trace with the tick from which it holds, so that a log can be computed again. What a session begins
+with is decided by `controller.after_restart`; the plant gets a record, for the controller after this one.
 """
 
 from __future__ import annotations
@@ -38,22 +37,12 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector, distance, to_eul
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
-from aeroloop.service.control.motion import (
-    START_WITHIN_DEG,
-    Approach,
-    nearest_turn,
-    shortest,
-    shortest_from_rest,
-    to_set_point,
-)
+from aeroloop.service.control.motion import START_WITHIN_DEG, Approach, shortest, shortest_from_rest, to_set_point
 from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 
-START_S: Final = 1.0
-"""Least time to reach a reference that no operator gave a time for, at a session's start [s]."""
-SETPOINTS: Final = 4
-"""Set-points of a stream that are read before a tick; of more, the newest."""
-_DECIMALS: Final = 3
-"""Of an attitude found [deg]: far finer than any level, and short to print."""
+START_S: Final = 1.0  # least time to reach a reference that no operator gave a time for, at a session's start [s]
+SETPOINTS: Final = 4  # set-points of a stream that are read before a tick; of more, the newest
+_DECIMALS: Final = 3  # of an attitude found [deg]: far finer than any level, and short to print
 
 
 class OperatorChanges:
@@ -64,45 +53,37 @@ class OperatorChanges:
     """
 
     def __init__(self, role: Node, settings: Settings, trace: TraceWriter, why_none: Callable[[], str]) -> None:
-        law, own = settings.law, settings.controller
-        self._role, self._law, self._trace, self._why_none = role, law, trace, why_none
-        self._configured = reference = settings.reference
-        self._after_restart = own.after_restart
+        own, reference = settings.controller, settings.reference
+        self._role, self._law, self._trace, self._why_none = role, settings.law, trace, why_none
+        self._configured, self._after_restart = reference, own.after_restart
         rolls = settings.wire.actuators > 2
         self._limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=rolls)
-        self.setpoints = SetpointStream(role)
+        self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
+        self._setpoint_s = 0.0  # when the stream last had a set-point, or began; 0 once its silence was an event
+        self.refused = 0  # set-points so far, malformed or beyond the limits
         self._controller: Controller | None = None
         self._k = 0
         self._started_near = True
         self._present_reference: Reference = reference  # what the motion follows: of a stream, its last set-point
         self._last: SessionRecord | None = None  # this controller's own last session
         self.record = SessionRecord(
-            controller=role.name,
-            session=None,
-            gains=gains_of(law),
-            gains_from="configured",
-            reference=reference,
-            reference_from="configured",
-            within_s=0.0,
-            since_tick=0,
-        )
+            controller=role.name, session=None, gains=gains_of(settings.law), gains_from="configured",
+            reference=reference, reference_from="configured", within_s=0.0, since_tick=0,
+        )  # fmt: skip
         if self._after_restart != "configured":
             self._begin_with(Hold(), "held")
 
     # ── requests: checked in their topic's thread, applied between two ticks ──
 
     def serve(self) -> None:
-        """Serve `set_gains`, `track` and `show`. FollowError is the answer where one is refused."""
+        """Serve `set_gains`, `track` and `show`."""
         self._role.serve("set_gains", Gains, self._prepare_gains)
         self._role.serve("track", Track, self._prepare_track)
         self._role.serve("show", Request, lambda _: lambda: self.record)
 
     def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
         self._running()
-        try:
-            with_gains(self._law, gains)
-        except LawError as error:
-            raise FollowError(str(error)) from None
+        with_gains(self._law, gains)
         return lambda: self._set_gains(gains)
 
     def _prepare_track(self, track: Track) -> Callable[[], Answer]:
@@ -114,7 +95,6 @@ class OperatorChanges:
         return lambda: self._track(reference, trajectory, track.within_s, source)
 
     def _set_gains(self, gains: Gains) -> Answer:
-        """No event and no record if the gains change nothing."""
         controller = self._running()
         before = controller.gains
         controller.set_gains(gains)
@@ -128,7 +108,7 @@ class OperatorChanges:
     def _track(self, reference: Reference, trajectory: Trajectory, within_s: float | None, source: Source) -> Answer:
         """Follow a checked reference from this tick on, reached in `within_s` [s]; None: as soon as the limits allow.
 
-        Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
+        Coming to rest takes as long as braking does, whatever is given.
         """
         motion, held, t = self._running().motion, reference, self._time
         if isinstance(reference, Stream) or reference == Hold():
@@ -138,8 +118,10 @@ class OperatorChanges:
         else:
             approach = shortest(trajectory, motion.here(t), self._limits)
             approach = approach.lasting(approach.within_s if within_s is None else within_s, self._limits)
-        self.setpoints.begin()
-        text = f"{_action_text(reference)} within {approach.within_s:.4g} s"
+        self._discard_setpoints()
+        self._setpoint_s = self._role.clock.monotonic()
+        words = in_words(reference if isinstance(reference, Stream) else held)
+        text = f"follows {words} within {approach.within_s:.4g} s"
         self._approach(held, trajectory, approach, text, reference, source)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
@@ -153,9 +135,9 @@ class OperatorChanges:
         if self._after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self.record.gains)
-        controller.motion.follow(Trajectory.of(self._present_reference), 0.0)
+        controller.motion.follow(Trajectory.of(self._present_reference), 0.0, Approach())
         self._started_near = False
-        self.setpoints.discard()
+        self._discard_setpoints()
         self._record_change(gains=self.record.gains, reference=self._present_reference)
 
     def end(self) -> None:
@@ -214,8 +196,7 @@ class OperatorChanges:
                 return
             trajectory = Trajectory.of(target)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
-            approach = shortest_from_rest(trajectory, nearest_turn(start, trajectory), limits)
-            approach = approach.at_least(max(START_S, self.record.within_s))
+            approach = shortest_from_rest(trajectory, start, limits).at_least(max(START_S, self.record.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
         self._approach(target, trajectory, approach, text, self.record.reference, self.record.reference_from)
 
@@ -236,17 +217,38 @@ class OperatorChanges:
         self._role.take_inbox()
 
     def _follow_stream(self, stream: Stream) -> None:
-        newest = self.setpoints.newest(stream, self._limits, self.record.session, self._k)
-        if newest is None:
-            return
-        hold, trajectory = newest
-        try:
-            here = self._running().motion.here(self._time)
-            approach = to_set_point(trajectory, here, stream.within_s, self._limits)
-        except FollowError as error:
-            self.setpoints.refuse(error, self.record.session)
-            return
-        self._follow(hold, trajectory, approach)
+        """Follow the newest set-point received since the last tick that is not refused; report a silent stream."""
+        now_s, newest = self._role.clock.monotonic(), None
+        for _ in range(SETPOINTS):
+            if (sample := self._received.try_recv()) is None:
+                break
+            try:
+                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
+                trajectory = Trajectory.of(hold)
+                trajectory.check(self._limits)
+                newest = hold, trajectory
+            except (MessageError, FollowError) as error:
+                self._refuse_setpoint(error)
+        if newest is not None:
+            self._setpoint_s = now_s
+            try:
+                here = self._running().motion.here(self._time)
+                self._follow(*newest, to_set_point(newest[1], here, stream.within_s, self._limits))
+            except FollowError as error:
+                self._refuse_setpoint(error)
+        elif self._setpoint_s and now_s - self._setpoint_s > stream.timeout_s:
+            self._setpoint_s = 0.0
+            text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
+            self._role.event("lost", text, self.record.session, self._k)
+
+    def _refuse_setpoint(self, error: AeroloopError) -> None:
+        self.refused += 1
+        self._role.warn("set-point", "fault", f"set-point refused: {error}", self.record.session)
+
+    def _discard_setpoints(self) -> None:
+        """Discard those received before now, which are of the previous stream or session."""
+        while self._received.try_recv() is not None:
+            pass
 
     def _approach(
         self, to: Reference, trajectory: Trajectory, approach: Approach, text: str, asked: Reference, source: Source
@@ -278,20 +280,6 @@ class OperatorChanges:
         self.record = self.record.model_copy(update=changed)
 
 
-def _action_text(reference: Reference) -> str:
-    match reference:
-        case Hold(attitude=None):
-            return "comes to rest"
-        case Hold(attitude=(roll, pitch, yaw)):
-            return f"turns to roll {roll:g}°, pitch {pitch:g}°, yaw {yaw:g}°"
-        case Points(times=times):
-            return f"follows {len(times)} points over {times[-1]:g} s, from the first of them"
-        case Stream(timeout_s=timeout_s):
-            return f"follows what streams on `reference`, silent for {timeout_s:g} s at the most; at rest"
-        case _:
-            return f"follows a {reference.kind}, reached"
-
-
 def rest_of_reference(last: SessionRecord, period: float) -> Reference:
     """What a session that was cut short had still to follow; period in s.
 
@@ -312,49 +300,3 @@ def hold_here(attitude: Quaternion, *, rolls: bool) -> Vector:
     """Roll, pitch, yaw at which the body is found [deg]; roll is 0 for a vehicle that cannot roll."""
     roll, pitch, yaw = (round(degrees(angle), _DECIMALS) for angle in to_euler(attitude))
     return (roll if rolls else 0.0, pitch, yaw)
-
-
-class SetpointStream:
-    """Set-points received for a role's vehicle, read in the loop."""
-
-    def __init__(self, role: Node) -> None:
-        self._role = role
-        self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
-        self._last_s = 0.0  # when the last one was read, or the stream begun; 0 once its silence was an event
-        self.refused = 0  # so far, malformed or beyond the limits
-
-    def discard(self) -> None:
-        """Discard those received before now, which are of the previous stream or session."""
-        while self._received.try_recv() is not None:
-            pass
-
-    def begin(self) -> None:
-        """Begin a stream: silence counts from now on."""
-        self.discard()
-        self._last_s = self._role.clock.monotonic()
-
-    def newest(self, stream: Stream, limits: Limits, session: str | None, k: int) -> tuple[Hold, Trajectory] | None:
-        """The newest set-point received since the last tick that is not refused; silence of `timeout_s` is an event."""
-        now, newest = self._role.clock.monotonic(), None
-        for _ in range(SETPOINTS):
-            if (sample := self._received.try_recv()) is None:
-                break
-            try:
-                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
-                trajectory = Trajectory.of(hold)
-                trajectory.check(limits)
-            except (MessageError, FollowError) as error:
-                self.refuse(error, session)
-            else:
-                newest = hold, trajectory
-        if newest is not None:
-            self._last_s = now
-        elif self._last_s and now - self._last_s > stream.timeout_s:
-            self._last_s = 0.0
-            self._role.event("lost", f"no set-point for {stream.timeout_s:g} s: holds the last one", session, k)
-        return newest
-
-    def refuse(self, error: AeroloopError, session: str | None) -> None:
-        """Count a set-point that is not followed, and report it."""
-        self.refused += 1
-        self._role.warn("set-point", "fault", f"set-point refused: {error}", session)

@@ -14,26 +14,23 @@ STATUS_EVERY_S: Final = 1.0
 def run_plant(role: Node, settings: Settings) -> None:
     """Run the configured plant end until the role's `stop` is set: emulator, CAN bridge or Quanser board.
 
-    Raises:
-        AeroloopError: It cannot run, in one line.
-        ValueError: The configuration does not fit it, in one line.
+    Raises AeroloopError if it cannot run, ValueError if the configuration does not fit it, both in one line.
     """
     loop, wire, plant = settings.loop, settings.wire, settings.plant
     if plant.via == "can":
         from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 
         Bridge(role, loop, wire, plant, settings.can).run()
-        return
-    if plant.via == "emulator":
+    elif plant.via == "emulator":
         from aeroloop.plant_emulator.hosts.emulator import run_emulator
 
         run_emulator(role, loop, wire, plant)
-        return
-    from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
-    from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
+    else:
+        from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
+        from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 
-    driver = BoardDriver(loop, wire, plant, role.stop)
-    driver.run(ZenohNetwork(role, loop, driver.endpoint, plant.state_directory))
+        driver = BoardDriver(loop, wire, plant, role.stop)
+        driver.run(ZenohNetwork(role, loop, driver.endpoint, plant.state_directory))
 
 
 def run_router(role: Node) -> None:

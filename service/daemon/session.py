@@ -1,8 +1,7 @@
 """One session of the controller, from the grant to its end: wait → tick → send → account.
 
-`tick_source.py` defines a tick; in lockstep the same loop runs as fast as the plant sends. After `stale_s` without a
-measurement the session is given up and nothing more is sent; the plant's watchdog does the rest. Every tick is a row of
-the trace, which is published after the command.
+In lockstep the same loop runs as fast as the plant sends. After `stale_s` without a measurement the session is given up
+and nothing more is sent; the plant's watchdog does the rest. Every tick is a row of the trace.
 """
 
 from __future__ import annotations
@@ -12,12 +11,10 @@ import secrets
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from threading import Thread
 from typing import Final
 
-import zenoh
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
@@ -40,23 +37,16 @@ from aeroloop.service.daemon.tick_source import PlantTick, TickSource
 
 LOCKSTEP_PATIENCE_S: Final = 2.0
 """Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
-WAIT_S: Final = 0.02
-"""How often the session is checked while nothing is received [s]."""
-STATUSES: Final = 4
-"""Statuses of the plant that wait to be read; the newest of more."""
-READ_S: Final = 0.01
-"""How often they are read [s]."""
-STALL_TICKS: Final = 10
-"""Ticks missed in a row that cause a warning."""
-TELEMETRY_HZ: Final = 10.0
-"""Telemetry is for people: the trace has every tick [Hz]."""
+WAIT_S: Final = 0.02  # how often the session is checked while nothing is received [s]
+READ_S: Final = 0.01  # least time between two readings of the plant's status [s]
+STALL_TICKS: Final = 10  # ticks missed in a row that cause a warning
+TELEMETRY_HZ: Final = 10.0  # telemetry is for people: the trace has every tick [Hz]
 LAW_TIMEOUT_S: Final = 0.1
 """A tick of the law that takes longer faults the controller, except in lockstep [s]. By then the plant's watchdog, with
 its default time, has set 0 V."""
-REPORT_S: Final = 1.0
-"""A tick that lasts longer is reported while it lasts [s]."""
-STOP_S: Final = 2.0
-"""How long a hanging tick may outlast a request to stop [s]."""
+REPORT_S: Final = 1.0  # a tick that lasts longer is reported while it lasts [s]
+STOP_S: Final = 2.0  # how long a hanging tick may outlast a request to stop [s]
+CHECK_S: Final = 0.1  # how often a law in Python is checked [s]
 
 
 class Shared:
@@ -93,18 +83,10 @@ class Session:
     """The session that `Shared.claims` has just been granted; `publish_status` publishes the status when it is due."""
 
     def __init__(
-        self,
-        role: Node,
-        settings: Settings,
-        shared: Shared,
-        controller: Controller,
-        link: ZenohLink,
+        self, role: Node, settings: Settings, shared: Shared, controller: Controller, link: ZenohLink,
         publish_status: Callable[[], None],
-    ) -> None:
-        self._role = role
-        self._clock = role.clock
-        self._shared = shared
-        self._link = link
+    ) -> None:  # fmt: skip
+        self._role, self._clock, self._shared, self._link = role, role.clock, shared, link
         self._publish_status = publish_status
         self.controller = controller
         self.name = shared.claims.session or ""
@@ -175,13 +157,13 @@ class Session:
 
     def _why_lost(self, silent_s: float) -> str | None:
         """Why the session is lost, if it is: the plant has ended it, is gone, or has been silent for too long."""
-        status = self._shared.plant
-        plant = status.read()
-        if plant is not None and status.granted and plant.session != self.name:
-            return f"the plant ended the session{': ' + plant.cause if plant.cause else ''}"
+        plant = self._shared.plant
+        status, granted = plant.read(), plant.granted
+        if status is not None and granted and status.session != self.name:
+            return f"the plant ended the session{': ' + status.cause if status.cause else ''}"
         # In lockstep a granted plant may pause between steps: it is lost only when its session ends or it is gone.
-        patience = LOCKSTEP_PATIENCE_S if self._lockstep and not status.granted else self._stale_s
-        if silent_s > patience and not (self._lockstep and status.granted and plant is not None):
+        patience = LOCKSTEP_PATIENCE_S if self._lockstep and not granted else self._stale_s
+        if silent_s > patience and (plant.gone or not (self._lockstep and granted)):
             return f"no measurement for {silent_s * 1e3:.0f} ms"
         return None
 
@@ -273,68 +255,52 @@ class Session:
 def telemetry_of(controller: Controller, session: str) -> Telemetry:
     """The controller's last tick in a session."""
     return Telemetry(
-        session=session,
-        tick=controller.tick_index,
-        counter=controller.counter,
-        attitude_error=controller.attitude_error,
-        rate_error=controller.rate_error,
-        desired=controller.desired,
-        state=controller.law_state,
-        voltages=controller.voltages,
-    )
+        session=session, tick=controller.tick_index, counter=controller.counter,
+        attitude_error=controller.attitude_error, rate_error=controller.rate_error, desired=controller.desired,
+        state=controller.law_state, voltages=controller.voltages,
+    )  # fmt: skip
 
 
 class PlantStatus:
-    """The plant's newest status; `granted` is whether one has named the session that is followed."""
+    """The plant's newest status; `granted`: one has named the session that is followed; `gone`: the plant's token is.
+
+    What was received is read every `READ_S`, so that a flood of statuses costs the loop nothing.
+    """
 
     def __init__(self, role: Node) -> None:
         self._role = role
         self._newest: Status | None = None
         self._due_s = 0.0
-        self._appeared = 0  # how often the plant's token has appeared or disappeared
-        self._session, self.granted = "", False
-        self._received = role.zenoh.declare_subscriber(
-            topics.key("status", role.vehicle, role="plant"), RingChannel(STATUSES)
-        )
+        self._session, self.granted, self.gone = "", False, False
+        key = topics.key("status", role.vehicle, role="plant")
+        self._received = role.zenoh.declare_subscriber(key, RingChannel(1))
 
     def follow(self, session: str) -> None:
         """Follow a new session."""
         self._session, self.granted = session, False
 
     def see(self, appeared: bool) -> None:
-        """Forget the plant's status once its token is gone; called when the token appears or disappears."""
-        self._appeared += 1
-        if not appeared:
-            with suppress(zenoh.ZError):  # this process is ending, too, and its ring is gone
-                while self._received.try_recv() is not None:  # its last ones
-                    pass
-            self._newest = None
+        """The plant's token appears or disappears."""
+        self.gone = not appeared
 
     def read(self) -> Status | None:
-        """None before the first status, and once the plant is gone. What was received is read every `READ_S`."""
-        now, appeared = self._role.clock.monotonic(), self._appeared
-        if now < self._due_s:
+        """The newest status; None before the first."""
+        if self._role.clock.monotonic() < self._due_s or (sample := self._received.try_recv()) is None:
             return self._newest
-        self._due_s = now + READ_S
-        for _ in range(STATUSES):
-            if (sample := self._received.try_recv()) is None:
-                break
-            try:
-                status = Status.decode(sample.payload.to_bytes(), extra="ignore")
-            except MessageError:
-                self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
-                continue
-            if appeared == self._appeared:
-                self._newest = status
-            self.granted = self.granted or status.session == self._session
+        self._due_s = self._role.clock.monotonic() + READ_S
+        try:
+            self._newest = Status.decode(sample.payload.to_bytes(), extra="ignore")
+        except MessageError:
+            self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
+        else:
+            self.granted = self.granted or self._newest.session == self._session
         return self._newest
 
 
 class LawWatch(Thread):
     """Watch of a law in Python: an event while a tick does not end, and the process's end if it never does.
 
-    The plant needs none of it: without commands its watchdog sets 0 V. But a loop that hangs in a user's code can
-    neither say so nor stop when it is asked to.
+    The plant's watchdog sets 0 V without it; but a loop that hangs in a user's code cannot stop when it is asked to.
     """
 
     def __init__(self, role: Node, law: str) -> None:
@@ -344,16 +310,13 @@ class LawWatch(Thread):
 
     def run(self) -> None:
         """Watch until the process ends."""
-        reported = stopping = None
+        stopping_s = 0.0
         while True:
-            time.sleep(0.1)
-            begun, now = self.begun, self._role.clock.monotonic()
-            stopping = (stopping or now) if self._role.stop.is_set() else None
-            if begun is None or now - begun < REPORT_S:
-                continue
-            if begun != reported:
-                reported = begun
-                self._role.event("fault", f"{self._law} has not ended a tick for {now - begun:.1f} s")
-            if stopping is not None and now - stopping > STOP_S:
+            time.sleep(CHECK_S)
+            begun, stopping_s = self.begun, stopping_s + CHECK_S if self._role.stop.is_set() else 0.0
+            lasts_s = 0.0 if begun is None else self._role.clock.monotonic() - begun
+            if lasts_s > REPORT_S:
+                self._role.warn("law", "fault", f"{self._law} has not ended a tick for {lasts_s:.1f} s")
+            if lasts_s > REPORT_S and stopping_s > STOP_S:
                 sys.stderr.write(f"aeroloop: {self._law} does not end its tick: the process ends without it\n")
                 os._exit(1)

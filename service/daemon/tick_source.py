@@ -21,30 +21,19 @@ from aeroloop.protocol.wire.transmit import UNCHANGED
 MAILBOX: Final = 16
 """Frames that may wait where silence is allowed: a displaced frame could not be classified as late."""
 
-PATIENCE: Final = 0.5
-"""Share of a period by which a frame may be later than the fastest before its tick is silent."""
+PATIENCE: Final = 0.5  # share of a period by which a frame may be later than the fastest before its tick is silent
 
 
 class PlantTick(NamedTuple):
-    """One tick of the plant, or a frame that arrived when its tick was over.
-
-    Attributes:
-        tick: The session tick.
-        frame: The measurement; UNCHANGED if its levels have not changed.
-        received_as: Classification. A late frame is no tick; only its levels are used.
-        at_ns: When the frame arrived, or the tick became silent, on `time.monotonic_ns()`: it can be answered now.
-        late_ns: How much later than the fastest the frame arrived [ns]; 0 for silence.
-        missed: Ticks between the last one and this that were not received in time.
-        fresh: Whether it shows that the plant is alive: a frame that is not stale or, in lockstep, an empty one.
-    """
+    """One tick of the plant in a session, or a frame that arrived when its tick was over."""
 
     tick: int
-    frame: bytes
-    received_as: Received
-    at_ns: int
-    late_ns: int = 0
-    missed: int = 0
-    fresh: bool = False
+    frame: bytes  # the measurement; UNCHANGED if its levels have not changed
+    received_as: Received  # a late frame is no tick; only its levels are used
+    at_ns: int  # when the frame arrived, or the tick became silent, on `time.monotonic_ns()`
+    late_ns: int = 0  # how much later than the fastest the frame arrived; 0 for silence
+    missed: int = 0  # ticks between the last one and this that were not received in time
+    fresh: bool = False  # whether it shows that the plant is alive: not stale; in lockstep also an empty frame
 
 
 class TickSource:
@@ -54,8 +43,7 @@ class TickSource:
     """
 
     def __init__(self, link: Link, loop: LoopSettings, wire: WireSpec, *, stale_s: float, clock: Clock = time) -> None:
-        self._link = link
-        self._clock = clock
+        self._link, self._clock = link, clock
         self._counter = wire.measurement.counter
         self._ticks = TickCounter(loop.period_ns, wire.measurement.counters, lockstep=loop.lockstep)
         self._lockstep = loop.lockstep

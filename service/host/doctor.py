@@ -18,9 +18,9 @@ from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid
-from aeroloop.protocol.transport.certificate import PLAIN_S, SOON_DAYS, CertificateError, read_certificate, refusal
-from aeroloop.protocol.transport.endpoint import Endpoint, accepting
-from aeroloop.protocol.transport.network_settings import PORTS, NetworkSettings, opened
+from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
+from aeroloop.protocol.transport.network import PLAIN_S, accepting, refusal
+from aeroloop.protocol.transport.network_settings import PORTS, Endpoint, NetworkSettings, opened
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host.health import LATE_SHARE
 

@@ -24,10 +24,9 @@ from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.host import listener
 from aeroloop.protocol.runtime.node import ASKER_LENGTH
-from aeroloop.protocol.transport.certificate import Certificate, refusal
-from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session
-from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
+from aeroloop.protocol.transport.certificate import Certificate
+from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session, refusal
+from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings
 
 ANSWER_S: Final = 1.0
 

@@ -251,7 +251,7 @@ def draw_burden(burden: Burden, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from aeroloop.service.report import figure_style as style
+    from aeroloop.service.report import plots as style
 
     colours = style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.BLACK
     looks = dict(zip([*QUANTIZERS, None], zip(colours, "os^pD", strict=True), strict=True))

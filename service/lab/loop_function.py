@@ -31,9 +31,8 @@ from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, leve
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law
-from aeroloop.service.control.laws.registry import law_class, law_of
+from aeroloop.service.control.laws.registry import configured_gains, initial_state, law_class, law_function, law_of
 from aeroloop.service.control.reference import Floats, desired
 
 BLOCK: Final = 512

@@ -25,8 +25,7 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError, Settings
-from aeroloop.service.control.laws.evaluation import initial_state
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.logs.copies import write_decoded
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording

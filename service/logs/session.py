@@ -151,12 +151,8 @@ def table_of(
     Returns:
         The table, the controller's states as of `Session.states`, and how many batches of another wire are left out.
     """
-    sizes = wire.measurement.size, wire.command.size, wire.actuators
-    fitting = [
-        one
-        for one in entries
-        if (one.header.measurement_bytes, one.header.command_bytes, one.header.actuators) == sizes
-    ]
+    sizes = wire.actuators, wire.measurement.size, wire.command.size
+    fitting = [one for one in entries if one.header.row_dtype == row_dtype(one.header.end, *sizes)]
     kinds = row_dtype(end, *sizes)
     wide = {"tick", "session_tick", "answered", "received", "sent"}
     columns = [

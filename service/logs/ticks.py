@@ -26,8 +26,7 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.control.laws.evaluation import configured_gains
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import configured_gains, law_of
 from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 

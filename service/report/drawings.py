@@ -1,7 +1,6 @@
 """Drawings of the page: panels over time as Plotly's traces and layouts, as JSON with typed arrays.
 
-Lines have every tick that the report has; page.js reduces them to what is in sight. Plotly interprets tags in text, so
-names and labels are escaped.
+page.js reduces lines to what is in sight. Plotly interprets tags in text, so names and labels are escaped.
 """
 
 from __future__ import annotations
@@ -16,15 +15,13 @@ from aeroloop.service.logs.session import Array
 from aeroloop.service.report.rows import grave
 from aeroloop.service.review.report import Line, Report
 
+# Of runs, in turn: Okabe and Ito's colours, darkened until they can be read on white; dashes for print.
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#b0568c", "#8a6d00", "#5b4bb5", "#3f4a56", "#8b2e16")
-"""Of runs, in turn: Okabe and Ito's, darkened until they can be read on white."""
 DASHES: Final = ("solid", "7px,2px", "2px,2px", "9px,2px,2px,2px", "14px,3px", "4px,4px")
-"""Of runs, in turn, for print and for eyes that see no colours."""
 INK, QUIET, GRID, BAND, GRAVE, MARK = "#1a1e24", "#58616d", "#eceff2", "#8a6d00", "#b03a00", "#8b95a3"
 MEASURED, DESIRED, TRUE = "#0072b2", "#d55e00", "#009e73"
 
-WIDE: Final = 30.0
-"""Durations that differ by more than this factor have a logarithmic axis."""
+WIDE: Final = 30.0  # durations that differ by more than this factor have a logarithmic axis
 
 Json = dict[str, Any]
 
@@ -42,7 +39,7 @@ class Drawing(NamedTuple):
 def drawings(reports: Sequence[Report]) -> list[Drawing]:
     """A drawing for each group of panels, in the order of the reports."""
     groups = dict.fromkeys(panel.group for report in reports for panel in report.panels)
-    shapes, labels = list(_shapes(reports)), list(_fault_labels(reports))
+    shapes, labels = list(_shapes(reports)), _fault_labels(reports)
     return [_drawing(group, reports, shapes, labels) for group in groups]
 
 
@@ -156,14 +153,14 @@ def _shapes(reports: Sequence[Report]) -> Iterator[Json]:
                 yield across | {"path": path, "opacity": max(0.2, opacity), "line": line}
 
 
-def _fault_labels(reports: Sequence[Report]) -> Iterator[Json]:
+def _fault_labels(reports: Sequence[Report]) -> list[Json]:
     """Names of the faults, where they begin, in three rows at the top of the first panel."""
+    alike = {
+        "xanchor": "left", "y": 1, "yref": "paper", "yanchor": "top", "showarrow": False, "borderpad": 0,
+        "font": {"size": 11, "color": INK},
+    }  # fmt: skip
     found = [(start, label) for report in reports for start, _, label in _faults(report)]
-    for i, (start, label) in enumerate(found):
-        yield {
-            "text": _plain(label), "x": start, "xanchor": "left", "y": 1, "yref": "paper", "yanchor": "top",
-            "yshift": -12 * (i % 3), "showarrow": False, "font": {"size": 11, "color": INK}, "borderpad": 0,
-        }  # fmt: skip
+    return [alike | {"text": _plain(label), "x": x, "yshift": -12 * (i % 3)} for i, (x, label) in enumerate(found)]
 
 
 def _faults(report: Report) -> list[tuple[float, float, str]]:

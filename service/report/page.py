@@ -31,44 +31,29 @@ def page(reports: Sequence[Report]) -> str:
         raise ValueError("a page needs a run")
     from plotly.offline import get_plotlyjs
 
-    loader = FileSystemLoader(HERE)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    blocks: Json = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, **blocks)
     environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
     environment.tests["grave"] = rows.grave
     scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]
     hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
     runs, drawn = [report.findings for report in reports], drawings(reports)
     return environment.get_template("page.html").render(
-        reports=reports,
-        runs=list(enumerate(reports)),
-        several=len(reports) > 1,
+        reports=reports, runs=list(enumerate(reports)), several=len(reports) > 1,
         policy=f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:",
-        style=(HERE / "page.css").read_text(encoding="utf-8"),
-        scripts=scripts,
-        data=page_data(reports, drawn),
-        drawings=drawn,
-        colours=COLOURS,
-        rows=rows.figure_rows(runs),
-        differences=differences(reports),
+        style=(HERE / "page.css").read_text(encoding="utf-8"), scripts=scripts,
+        data=page_data(reports, drawn), drawings=drawn, colours=COLOURS,
+        rows=rows.figure_rows(runs), differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),
-        missing=[rows.missing(run) for run in runs],
-        theorem=[rows.theorem_sentences(run) for run in runs],
-        durations=rows.durations(runs),
-        percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
-        verdict=verdict,
-        largest_error=largest_error,
-        thinned=max(reports, key=lambda report: report.thinned),
-    )
+        missing=[rows.missing(run) for run in runs], theorem=[rows.theorem_sentences(run) for run in runs],
+        durations=rows.durations(runs), percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
+        verdict=verdict, largest_error=largest_error, thinned=max(reports, key=lambda report: report.thinned),
+    )  # fmt: skip
 
 
 def verdict(run: Findings) -> tuple[str, bool | None, str]:
-    """Verdict on a run in a word, whether it is good (None: nothing was required), and because of what.
-
-    By the limits of `--require`; without any, by trips, missing figures, faults and losses.
-    """
+    """Verdict on a run in a word, whether it is good (None: nothing was required), and because of what."""
     found: tuple[str, bool | None, str]
     troubles, limits = sum(map(rows.grave, run.marks)), rows.count(len(run.checks), "limit")
     if broken := sum(not check.holds for check in run.checks):

@@ -1,20 +1,82 @@
-"""Figures of a session for a paper: roll, pitch and yaw, Figures C.4–C.14, and ‖z‖, as PDF, SVG and PNG."""
+"""Figures for print: a session's as PDF, SVG and PNG (roll, pitch and yaw, Figures C.4–C.14, ‖z‖), and their style.
+
+The style has a journal's column widths and Okabe and Ito's colours. The same bytes come out for the same figure: files
+have no date, and SVG ids no salt.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from aeroloop.service.config import Settings
+from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Progress, ReviewError
-from aeroloop.service.report.figure_style import BLUE, GREEN, ORANGE, WIDTH_IN, figure_style, save
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
+
+WIDTH_IN: Final[dict[int, float]] = {1: 3.5, 2: 7.16}  # width of one column, and of two, in IEEE's journals [in]
+
+FORMATS: Final[dict[str, dict[str, Any]]] = {
+    "pdf": {"metadata": {"CreationDate": None}},
+    "svg": {"metadata": {"Date": None}},
+    "png": {"dpi": 600},
+}  # suffixes of every figure, with the options of each
+
+BLUE, ORANGE, GREEN, PURPLE, BLACK = "#0072b2", "#d55e00", "#009e73", "#b0568c", "#222222"
+
+
+def figure_style() -> AbstractContextManager[None]:
+    """Every figure that is drawn and saved within has the style."""
+    return style.context(Path(__file__).with_name("paper.mplstyle"))
+
+
+def logarithmic(panel: Axes, which: Literal["x", "y"], digits: Sequence[int]) -> None:
+    """Make an axis of a panel logarithmic, with plain numbers at these digits of each decade."""
+    axis = panel.xaxis if which == "x" else panel.yaxis
+    panel.set(**{f"{which}scale": "log"})
+    axis.set_major_locator(FixedLocator([digit * 10.0**power for power in range(-3, 6) for digit in digits]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def check_path(path: Path) -> Path:
+    """The path of a single figure. Raises OutputError if its suffix or folder is wrong."""
+    suffixes = [f".{name}" for name in FORMATS]
+    if path.suffix not in suffixes:
+        raise OutputError(f"a figure ends in {', '.join(suffixes)}, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"there is no folder {path.parent} for the figure")
+    return path
+
+
+def save_as(figure: Figure, path: Path) -> None:
+    """Save a figure in the format of the path's suffix. Raises OutputError if it cannot be written."""
+    try:
+        figure.savefig(check_path(path), **FORMATS[path.suffix[1:]])
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Save a figure in every format, and return the paths. Raises OSError if it cannot be written."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # laid out once, not for each format
+    paths = {folder / f"{name}.{suffix}": options for suffix, options in FORMATS.items()}
+    for path, options in paths.items():
+        figure.savefig(path, **options)
+    return list(paths)
+
+
+# ── figures of a session ──
 
 FIGURES: Final = ("angles", "attitude", "rate", "error", "rate_error", "input", "theorem")
 """Groups of panels that are drawn, a figure each."""

@@ -33,25 +33,21 @@ class Duration(NamedTuple):
     run: int
     label: str
     percentiles: list[str]
-    spread: Spread | None
+    spread: Spread | None = None
 
 
 DURATIONS: Final = {
     "latency": "latency", "measurement_delay": "plant to controller", "command_delay": "controller to plant",
     "period": "period",
 }  # fmt: skip
-"""Distributions and their labels."""
-
 PERCENTILES: Final = {"p50": "p50", "p90": "p90", "p99": "p99", "p999": "p99.9", "max": "longest"}
-"""Percentiles of a duration that are shown, and their names."""
 
 UNMET: Final = {
     "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
     "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
     "C.30": "the command is saturated or missing, against (C.30)",
     "Assumption 3": "the attitude error is larger than the certificate assumes",
-}
-"""Premises of Lemma 1 that a true state may not satisfy, and what that means."""
+}  # premises of Lemma 1 that a true state may not satisfy, and what that means
 
 
 def figure_rows(runs: Sequence[Figures]) -> list[Row]:
@@ -86,12 +82,9 @@ def durations(runs: Sequence[Findings]) -> list[Duration]:
         for i, run in enumerate(runs)
         if name in run.timing
     ]
-    return found + [
-        Duration(i, "age when used", [micros(run.age_us[each]) if each in run.age_us else "–" for each in PERCENTILES],
-                 None)
-        for i, run in enumerate(runs)
-        if run.age_us
-    ]  # fmt: skip
+    ages = [(i, run.age_us) for i, run in enumerate(runs) if run.age_us]
+    texts = [(i, [micros(age[each]) if each in age else "–" for each in PERCENTILES]) for i, age in ages]
+    return found + [Duration(i, "age when used", percentiles) for i, percentiles in texts]
 
 
 def missing(run: Findings) -> list[str]:

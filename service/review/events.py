@@ -1,14 +1,13 @@
-"""Events of a session: published events, changes, recorder losses, faults of the plant, and what statuses say.
+"""What happened in a session: events, changes, losses, faults of the plant, timing, gaps, and frames gone otherwise.
 
 An event is shown at its sender's time, wherever it stands in the file: with a session tick at that tick, any other by
-its time of publication on the session's clock, as the sender's own trace relates the two. For a sender without a
-trace, such as a recorder, the plant's trace does, for showing only.
+its time of publication, which the sender's own trace relates to ticks; for one without a trace the plant's does.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import inf, isfinite
 from operator import itemgetter
 from typing import Final, NamedTuple
@@ -18,12 +17,17 @@ import numpy as np
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Event, Loss, Status
 from aeroloop.protocol.messages.operator import Change, in_words
+from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, TrueStates
-from aeroloop.service.review.report import FaultInterval, Mark
+from aeroloop.service.logs.ticks import Codes, Flags, Ticks
+from aeroloop.service.review.report import FaultInterval, Gap, Mark, Spread
 
-MAX_MARKS: Final = 300
-"""Marks of a kind and role; one more stands for the rest."""
+LONGEST_GAPS: Final = 100
+_BIN_EDGES_US: Final = 2 ** (np.arange(32 * 16 + 1) / 16)
+"""16 bins an octave, from 1 µs to 2³² µs, as of protocol/runtime/timing.py."""
+MAX_MARKS: Final = 300  # marks of a kind and role; one more stands for the rest
 
 _MODELS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
@@ -80,25 +84,19 @@ def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Me
     return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
 
 
-class Happened(NamedTuple):
-    """What happened: marks in order of time, reasons of trips of the vehicle, messages that were lost by topic."""
+def happened(
+    messages: Messages, session: Session, span: tuple[int, int], alone: bool
+) -> tuple[list[Mark], list[str], dict[str, int]]:
+    """Marks in order of time, reasons of the vehicle's trips, and messages that the recorder lost, by topic.
 
-    marks: list[Mark]
-    trips: list[str]
-    losses: dict[str, int]
-
-
-def happened(messages: Messages, session: Session, span: tuple[int, int], alone: bool) -> Happened:
-    """What happened to the vehicle of a session; if `alone`, without the trips of its other sessions.
-
-    Marks outside of the `span` from the first to the last tick have no time.
+    If `alone`, without the trips of other sessions. Marks outside of the `span`, the first and last tick, have no time.
     """
     found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
     trips, losses = list[str](), Counter[str]()
     (first, last), latest = span, max(session.extent.last.values())
-    clocks, period = _Clocks(session), session.settings.loop.period
+    tick_at, period = _clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
-        tick = shown = clocks.tick(role, at_ns)
+        tick = shown = tick_at(role, at_ns)
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
             if message.kind == "changed" and role == "controller" and of_session:
@@ -127,7 +125,7 @@ def happened(messages: Messages, session: Session, span: tuple[int, int], alone:
             outside = -1 if shown < first else 1 if shown > last + 1 else 0
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
-    return Happened([mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses))
+    return [mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses)
 
 
 def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
@@ -161,15 +159,11 @@ def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]
             continue
         begin, end = max(0, one.begin_tick - first), inf if one.end_tick is None else one.end_tick - first
         if begin < min(ticks, end):
-            interval = FaultInterval(
-                fault=one.fault,
-                source=one.source,
-                begin_s=round(begin * period, 9),
+            found.append(FaultInterval(
+                fault=one.fault, source=one.source, effect=one.effect, begin_s=round(begin * period, 9),
                 end_s=None if end >= ticks else round(end * period, 9),
                 changed=one.changed - changed.get((one.fault, one.source, one.begin_tick), 0),
-                effect=one.effect,
-            )
-            found.append(interval)
+            ))  # fmt: skip
     return sorted(found, key=lambda interval: interval.begin_s)
 
 
@@ -183,29 +177,114 @@ def described(change: Change) -> str:
     return "; ".join(parts)
 
 
-class _Clocks:
-    """Relation of each end's wall clock to the ticks, by its rows of the session."""
+def _clocks(session: Session) -> Callable[[str, int], float]:
+    """The session's tick at a time on a role's wall clock, by its rows; negative before it, ∞ without any row."""
+    known = dict[str, tuple[int, Array, Array]]()
+    ends = ("controller", session.controller, session.at_controller), ("plant", session.plant, session.at_plant)
+    for end, rows, at in ends:
+        time = np.maximum(rows["received"], rows["sent"])
+        its, ticks = at[at >= 0], session.k[at >= 0]
+        its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
+        if len(its):
+            walls = (time + rows["wall"])[its]
+            order, first = np.argsort(walls, kind="stable"), int(walls.min())
+            known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
 
-    def __init__(self, session: Session) -> None:
-        self._period_ns = session.settings.loop.period * 1e9
-        self._known: dict[str, tuple[int, Array, Array]] = {}
-        for end, rows, at in (
-            ("controller", session.controller, session.at_controller),
-            ("plant", session.plant, session.at_plant),
-        ):
-            time = np.maximum(rows["received"], rows["sent"])
-            its, ticks = at[at >= 0], session.k[at >= 0]
-            its, ticks = its[time[its] >= 0], ticks[time[its] >= 0]
-            if len(its):
-                walls = (time + rows["wall"])[its]
-                order, first = np.argsort(walls, kind="stable"), int(walls.min())
-                self._known[end] = first, (walls[order] - first).astype(np.float64), ticks[order].astype(np.float64)
-
-    def tick(self, role: str, at_ns: int) -> float:
-        """The session's tick at a time on a role's wall clock; negative before the session. ∞ without any row."""
-        clock = self._known.get(role) or self._known.get("plant") or self._known.get("controller")
+    def tick(role: str, at_ns: int) -> float:
+        clock = known.get(role) or known.get("plant") or known.get("controller")
         if clock is None:
             return inf
         first, walls, ticks = clock
         within = min(max(at_ns - first, 0), int(walls[-1]))
-        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / self._period_ns
+        return float(np.interp(within, walls, ticks)) + (at_ns - first - within) / (session.settings.loop.period * 1e9)
+
+    return tick
+
+
+# ── timing, gaps, saturation, and frames that went otherwise ──
+
+
+def timing(ticks: Ticks) -> dict[str, Spread]:
+    """Distributions of durations by name, without those that no tick has."""
+    durations = {
+        "period": periods_ns(ticks), "latency": ticks.latency_ns, "measurement_delay": ticks.measurement_delay_ns,
+        "command_delay": ticks.command_delay_ns,
+    }  # fmt: skip
+    known = {name: values[~np.isnan(values)] for name, values in durations.items()}
+    return {name: spread(values) for name, values in known.items() if len(values)}
+
+
+def spread(nanoseconds: Array) -> Spread:
+    """Distribution of at least one duration [ns]; under 1 µs counts as 1 µs. Shape (n,)."""
+    us = np.clip(nanoseconds * 1e-3, *_BIN_EDGES_US[[0, -1]])
+    counts, _ = np.histogram(us, _BIN_EDGES_US)
+    p50, p90, p99, p999, most = np.percentile(us, [50, 90, 99, 99.9, 100]).round(1).tolist()
+    bins = [(round(float(_BIN_EDGES_US[i]), 3), int(counts[i])) for i in np.flatnonzero(counts)]
+    return Spread(count=len(us), p50=p50, p90=p90, p99=p99, p999=p999, max=most, bins=bins)
+
+
+def periods_ns(ticks: Ticks) -> Array:
+    """Time since the measurement sent before each; NaN of the first, and of those that were not sent. Shape (n,)."""
+    periods, sent = np.full(len(ticks.k), np.nan), np.flatnonzero(ticks.sent_ns >= 0)
+    periods[sent[1:]] = np.diff(ticks.sent_ns[sent])
+    return periods
+
+
+def gaps(answered: Integers, period: float) -> tuple[int, list[Gap]]:
+    """How many times ticks in a row were not answered, and the longest hundred, in order. Shape (n,)."""
+    missing = np.diff(answered) - 1
+    at = np.flatnonzero(missing)
+    longest = np.sort(at[np.argsort(missing[at], kind="stable")][-LONGEST_GAPS:])
+    found = [(int(answered[i]) + 1, int(missing[i])) for i in longest]
+    return len(at), [Gap(time_s=round(k * period, 9), tick=k, ticks=ticks) for k, ticks in found]
+
+
+def saturation(wire: WireSpec, measurements: Codes, commands: Codes) -> tuple[dict[str, float], dict[str, int]]:
+    """Share of each signal's values at its outermost level, and how many frames have a component without a valid value.
+
+    Shapes of the codes: (n, 6) and (m, actuators).
+    """
+    shares, invalid = dict[str, float](), dict[str, Flags]()
+    signals = {"attitude": measurements[:, :3], "rate": measurements[:, 3:], "voltage": commands}
+    for name, codes in signals.items():
+        quantizer = getattr(wire, name).quantizer()
+        invalid[name] = wrong = np.isnan(codes) | (codes == quantizer.invalid)
+        if valid := int((~wrong).sum()):
+            outermost = (np.abs(codes) >= quantizer.encode(quantizer.limit)) & ~wrong
+            shares[name] = int(outermost.sum()) / valid
+    measured = np.hstack([invalid["attitude"], invalid["rate"]]).any(axis=1)
+    return shares, {"measurement": int(measured.sum()), "command": int(invalid["voltage"].any(axis=1).sum())}
+
+
+def lapses(session: Session, missed: Integers) -> dict[str, int]:
+    """Deviations from one frame each way per tick, by kind; see `Findings.lapses`.
+
+    Of the ticks that were `missed`, those whose rows of the controller the log lacks do not count.
+    """
+    for gap in session.missing:
+        if gap.end == "controller" and gap.rows:
+            missed = missed[(missed < gap.first_tick) | (missed > (inf if gap.last_tick is None else gap.last_tick))]
+    first, last = session.k[[0, -1]] if len(session.k) else (0, -1)
+    ticks = np.maximum.accumulate(session.controller["tick"])  # a late row is of a lower one
+    received_as = session.controller["received_as"][(ticks >= first) & (ticks <= last)]
+    outcome = session.plant["outcome"][session.at_plant[session.at_plant >= 0]]
+    counts = {
+        "late": int((received_as == Received.LATE).sum()),
+        "malformed": int((received_as == Received.MALFORMED).sum()),
+        "stale": int((outcome == Outcome.STALE).sum()),
+        "repeated": int((outcome == Outcome.REPEATED).sum()),
+        "refused": int(np.isin(outcome, [Outcome.MALFORMED, Outcome.INVALID]).sum()),
+        "withheld": int((outcome == Outcome.WITHHELD).sum()),
+        "missed": len(missed),
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
+def of_nearer_sign(q: Array, other: Array) -> Array:
+    """Of ±q, which are the same attitude, the one nearer to another. Shapes (n, 4)."""
+    return np.asarray(np.where((q * other).sum(axis=1, keepdims=True) < 0, -q, q))
+
+
+def error_deg(error: Array) -> Array:
+    """Angle of an attitude error ε̃ [deg]. Shapes (n, 3) and (n,)."""
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(1.0, np.linalg.norm(error, axis=1)))))

@@ -1,7 +1,6 @@
 """Panels of a session: every quantity over time, in the order of the paper's figures and with their numbers.
 
-A run is one of the paper's three cases, and its titles have the paper's numbers where the paper has that figure. Every
-tick is drawn while there are few enough; of more, the least and the largest value of each bucket.
+Every tick is drawn while there are few enough; of more, the least and the largest value of each bucket.
 """
 
 from __future__ import annotations
@@ -13,34 +12,28 @@ from typing import Final
 import numpy as np
 
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.evaluation import initial_state
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Ticks, euler_deg
-from aeroloop.service.review.events import Truths
-from aeroloop.service.review.observations import error_deg, of_nearer_sign, periods_ns
+from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
 from aeroloop.service.review.theorem import TheoremCheck
 
 MAX_POINTS: Final = 180_000
 """Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
 
-DESIRED: Final = ("desired", "bound")
-"""Beginnings of the names of lines that a run should follow, or stay below."""
+DESIRED: Final = ("desired", "bound")  # beginnings of the names of lines that a run should follow, or stay below
 
 CASES: Final = {"continuous": "without quantization", "quantized": "with quantization", "wind": "with wind"}
 NUMBERS: Final[dict[str, dict[str, str]]] = {
     "continuous": {"error": "C.4", "rate_error": "C.5", "input": "C.6"},
     "quantized": {"attitude": "C.7", "rate": "C.8", "error": "C.9", "rate_error": "C.10", "input": "C.11"},
     "wind": {"error": "C.12", "rate_error": "C.13", "input": "C.14"},
-}
-"""Number of the paper's figure of a quantity, by case."""
+}  # number of the paper's figure of a quantity, by case
 
-NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))
-"""Of a log without true states."""
+NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))  # of a log without true states
 
-_Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]
-"""Group, title, a label and an axis for each column, unit, and the lines by name. Shapes (n,) or (n, columns)."""
+_Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]  # group, title, label of each column, unit, lines
 
 
 def case_of(settings: Settings) -> str:

@@ -186,25 +186,16 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """A run.
-
-    Attributes:
-        time: Times of every line, on the law's clock [s]. Shape (n,).
-        panels: What is drawn over time, in the order of the paper's figures.
-        thinned: Ticks per two points of a line, the least and the largest value; 1 or 2 if nothing was thinned out.
-        settings: The effective configuration, as nested tables; each section is of the role that owns it.
-        facts: Facts about software and host, by role: versions, git revision, kernel, notes.
-        part: The span of the law's clock that was read, if it is not the whole session [s].
-    """
+    """A run."""
 
     name: str
     findings: Findings
-    time: Array
-    panels: Sequence[Panel]
-    thinned: int
-    settings: dict[str, Any]
-    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
-    part: tuple[float, float] | None = None
+    time: Array  # of every line, on the law's clock [s]. Shape (n,)
+    panels: Sequence[Panel]  # in the order of the paper's figures
+    thinned: int  # ticks per two points of a line, the least and the largest value; 1 or 2 if nothing was thinned out
+    settings: dict[str, Any]  # effective, as nested tables; each section is of the role that owns it
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)  # about software and host, by role
+    part: tuple[float, float] | None = None  # span of the law's clock that was read, if not the whole session [s]
 
     @property
     def period_s(self) -> float | None:
@@ -232,10 +223,7 @@ ADDRESSES: Final = (
 
 
 def differences(reports: Sequence[Report]) -> list[tuple[str, list[Any]]]:
-    """Dotted keys that differ in the configurations of several runs, but addresses and paths; and each run's value.
-
-    A run that has none has None.
-    """
+    """Dotted keys that differ in the configurations of several runs, but addresses and paths; and each run's value."""
     tables = [flat(report.settings) for report in reports]
     keys = sorted(key for key in set().union(*tables) if not key.startswith(ADDRESSES))
     rows = [(key, [table.get(key) for table in tables]) for key in keys]

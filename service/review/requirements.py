@@ -90,11 +90,9 @@ LIMITED: Final = {
 }  # fmt: skip
 """Figures that can have a limit, by their paths in `--json`, and the limit's unit."""
 
-AT_LEAST: Final = ("theorem.held",)
-"""Figures of which more is better."""
+AT_LEAST: Final = ("theorem.held",)  # figures of which more is better
 
-UNSEEN_SHOWN: Final = 3
-"""Of what a figure does not see, so many are listed in its line."""
+UNSEEN_SHOWN: Final = 3  # of what a figure does not see, so many are listed in its line
 
 
 class LimitError(AeroloopError):
@@ -138,8 +136,7 @@ class Limit(NamedTuple):
     def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
         """Whether it holds, and what was found.
 
-        A limit that seems to hold does not where ticks or parts of files are unseen, unless `limits`, which are
-        required together with it, permit as many `missing_ticks` or `damages`.
+        It does not where ticks or parts of files are unseen, unless `limits` permit so many `missing_ticks`, `damages`.
         """
         value, unit = value_of(findings, self.path), LIMITED[self.path]
         space = "" if unit in ("", "°") else " "

@@ -1,7 +1,6 @@
 """Review of a log: every figure and finding, from the log alone.
 
-The log holds the configuration (roles' descriptions) and what each end did (traces), so the review recomputes the
-controller, bit for bit. Of several sessions, it judges the longest, unless one is named.
+The log holds the configuration and what each end did, so the review recomputes the controller, bit for bit.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from math import inf, isnan
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import BaseModel, Field
+
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError, Settings
@@ -20,15 +21,24 @@ from aeroloop.service.figures import Figures, figures
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, Session, Unknown
 from aeroloop.service.logs.ticks import Ticks, recompute
-from aeroloop.service.review.events import Messages, Truths, age_us, fault_intervals, happened, read_messages
-from aeroloop.service.review.observations import gaps, lapses, saturation, timing
+from aeroloop.service.review.events import (
+    Messages,
+    Truths,
+    age_us,
+    fault_intervals,
+    gaps,
+    happened,
+    lapses,
+    read_messages,
+    saturation,
+    timing,
+)
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
-from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, flat
+from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, differences, flat
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.theorem import TheoremCheck, check_theorem
 
 LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration is a loop's"
-"""Why a session in lockstep has no durations."""
 
 OWN_AFFAIRS: Final = (
     "loop.realtime", "loop.cpus", "plant.via", "plant.faults", "plant.fault_seed", "plant.armed_at_start",
@@ -57,9 +67,10 @@ class Review:
 
     def report(self, limits: Sequence[Limit] = (), points: int = MAX_POINTS) -> Report:
         """The review as data, checked against limits, with lines of at most so many points."""
-        time, panels, thinned = panels_of(self.settings, self.ticks, self.theorem, points, self.truths)
-        findings, settings = self.checked(limits), self.settings.description()
-        return Report(self.name, findings, time, panels, thinned, settings, self.facts, self.part)
+        drawn = panels_of(self.settings, self.ticks, self.theorem, points, self.truths)
+        return Report(
+            self.name, self.checked(limits), *drawn, self.settings.description(), facts=self.facts, part=self.part
+        )
 
 
 def review(*paths: Path) -> Figures:
@@ -77,8 +88,7 @@ def read(
 ) -> Review:
     """Read a run (logs, folders, or the files of a rotated run) and judge a session, or of it what is in this time [s].
 
-    Session and vehicle are as of `Recording.choose`, the time is the law's. Raises ReviewError: Not a log, several
-    unrelated runs, no such session, or nothing of it in this time.
+    Session and vehicle are as of `Recording.choose`, the time is the law's. Raises ReviewError.
     """
     try:
         recording = Recording(paths, progress)
@@ -99,7 +109,8 @@ def read(
         unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
     messages = read_messages(recording, which, settings.wire.actuators)
     recording.release()
-    events, faults = happened(messages, its, span, session is not None), fault_intervals(messages, its)
+    marks, trips, losses = happened(messages, its, span, session is not None)
+    faults = fault_intervals(messages, its)
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
     ticks, went = judged.ticks, lapses(its, judged.missed)
     its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
@@ -117,18 +128,12 @@ def read(
     if part is not None:
         reasons["duration_s"] = f"of the session only what is {_in_words(part)} was read"
     merits = figures(
-        settings.wire,
-        loop.period,
-        (ticks.k, ticks.attitude_error),
-        (judged.answered, judged.voltages),
-        watchdog_s=settings.plant.watchdog_s,
-        unsent=judged.unsent,
+        settings.wire, loop.period, (ticks.k, ticks.attitude_error), (judged.answered, judged.voltages),
+        watchdog_s=settings.plant.watchdog_s, unsent=judged.unsent, log=recording.name, trips=trips,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
-        log=recording.name,
-        trips=events.trips,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
         damages=[*recording.unread, *(f"malformed: {n} of {topic}" for topic, n in sorted(messages.malformed.items()))],
-    )
+    )  # fmt: skip
     controller = its.descriptions.get("controller")
     certificate = controller.certificate if controller else None
     theorem = check_theorem(settings, ticks, messages.truths, its.changes, certificate, faults=bool(faults))
@@ -136,45 +141,30 @@ def read(
     saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
     missing = [gap for gap in recording.missing if gap.vehicle == which[0]]
     started_s = ticks.wall_ns[:1] * 1e-9
+    recorded = [
+        Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
+        for (owner, one), extent in recording.extents.items()
+    ]
     findings = Findings(
         **{key: value for key, value in merits if key != "reasons"},
         reasons=merits.reasons | reasons | theorem.reasons,
-        vehicle=which[0],
-        session=which[1],
-        sessions=len(recording.sessions_of(which[0])),
-        recorded=[
-            Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
-            for (owner, one), extent in recording.extents.items()
-        ],
-        disagreements=disagreements(its.descriptions),
+        vehicle=which[0], session=which[1], sessions=len(recording.sessions_of(which[0])), recorded=recorded,
         started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
-        timing=spreads,
-        clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None,
-        age_us=age,
-        gaps=longest,
-        gap_count=gap_count,
-        saturated=saturated,
-        invalid=invalid,
-        losses=events.losses,
-        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS},
-        missing=missing,
-        unknown=its.unknown,
-        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
-        lapses=went,
-        theorem=theorem.findings,
-        marks=events.marks,
-        faults=faults,
-    )
+        disagreements=disagreements(its.descriptions), theorem=theorem.findings, marks=marks, faults=faults,
+        timing=spreads, clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None, age_us=age,
+        gaps=longest, gap_count=gap_count, saturated=saturated, invalid=invalid, losses=losses, lapses=went,
+        missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS}, missing=missing,
+        unknown=its.unknown, unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
+    )  # fmt: skip
     path = paths[0].resolve()
     name = path.name if path.is_dir() else path.stem
     name = name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"
-    return Review(
-        merits, findings, settings, ticks, theorem, messages.truths, name, _facts(recording, its, messages), part
-    )
+    facts = _facts(recording, its, messages)
+    return Review(merits, findings, settings, ticks, theorem, messages.truths, name, facts, part)
 
 
 def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:
-    """Facts about software and host by role: of descriptions, of the recorder's metadata, and the statuses' notes."""
+    """Facts about software and host by role."""
     described = session.descriptions.items()
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in described}
     for kind, values in recording.metadata.items():
@@ -201,3 +191,45 @@ def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
         if key.startswith(("loop.", "wire.", "plant.")) and not key.startswith(OWN_AFFAIRS)
         if controller.get(key) != plant.get(key)
     ]
+
+
+# ── several runs side by side ──
+
+
+class SettingDifference(BaseModel, frozen=True):
+    """A dotted key of the configuration whose value is not the same in every run; null where a run has no such key."""
+
+    key: str
+    values: dict[str, Any] = Field(description="by run")
+
+
+class Comparison(BaseModel, frozen=True):
+    """Runs by their names, which differ, and what differs in their configurations (`log compare --json`)."""
+
+    runs: dict[str, Findings]
+    differences: list[SettingDifference]
+
+    @classmethod
+    def of(cls, reports: Sequence[Report]) -> Comparison:
+        """Comparison of runs whose names differ."""
+        runs = {run.name: run.findings for run in reports}
+        rows = [(key, dict(zip(runs, values, strict=True))) for key, values in differences(reports)]
+        return cls(runs=runs, differences=[SettingDifference(key=key, values=values) for key, values in rows])
+
+
+def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
+    """A report of every log or folder, each a run of its own, checked against limits. Raises as `read` does.
+
+    Logs of one name are named with their folders, and if that is not enough, by number.
+    """
+
+    def share(done: int) -> Progress | None:
+        return None if progress is None else lambda part: progress((done + part) / len(logs))
+
+    points = MAX_POINTS // len(logs)  # one page holds them all
+    runs = [read(log, progress=share(i)).report(limits, points) for i, log in enumerate(logs)]
+    alike, names = [run.name for run in runs], list[str]()
+    for name, log in zip(alike, logs, strict=True):
+        long = name if alike.count(name) == 1 else f"{log.resolve().parent.name}/{name}"
+        names.append(long if long not in names else f"{long} ({sum(one.startswith(long) for one in names) + 1})")
+    return [replace(run, name=name) for run, name in zip(runs, names, strict=True)]

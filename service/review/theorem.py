@@ -22,8 +22,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.session import Array, Integers
 from aeroloop.service.logs.ticks import Flags, Ticks
-from aeroloop.service.review.events import Truths
-from aeroloop.service.review.observations import error_deg, of_nearer_sign
+from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem import bounds as lemma
 from aeroloop.service.theorem.certificate import promise

@@ -1,7 +1,4 @@
-"""Relay of the bridge, without a node: frames passed on, ticks, sessions. Its times are exact, sans-I/O.
-
-What it has in common with the plant's Endpoint, freshness, watchdog and latch: ../plant_emulator/endpoint.
-"""
+"""Relay of the bridge, without a node: what it does not share with the plant's Endpoint. Its times are exact."""
 
 from __future__ import annotations
 
@@ -55,8 +52,7 @@ def driven(wire: WireSpec = WIRE, *, lockstep: bool = False) -> Relay:
 def test_what_is_well_formed_passes_untouched_in_a_session_and_only_there(
     counter: int, codes: list[int], voltages: list[int]
 ) -> None:
-    it = granted()
-    there, back = measurement(counter, codes), WIRE.command.pack(counter, voltages)
+    it, there, back = granted(), measurement(counter, codes), WIRE.command.pack(counter, voltages)
     assert it.measurement(measurement(0)) == measurement(0)
     assert it.measurement(there) == there
     assert it.counter == counter

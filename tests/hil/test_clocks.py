@@ -32,12 +32,10 @@ time.time = lambda: time.time_ns() * 1e-9
 time.monotonic_ns = lambda: monotonic() + gained()
 time.monotonic = lambda: time.monotonic_ns() * 1e-9
 time.sleep = lambda seconds: sleep(seconds / rate)
-"""
-"""Clocks wrong by CLOCK_WRONG [s] that run at CLOCK_RATE; the wall clock steps once the file CLOCK_STEP is there."""
+"""  # clocks wrong by CLOCK_WRONG [s] that run at CLOCK_RATE; the wall clock steps once the file CLOCK_STEP is there
 
 
 def python_clocks(tmp_path: Path, **environment: str) -> dict[str, str]:
-    """The environment of a process with such clocks."""
     (tmp_path / "site").mkdir(exist_ok=True)
     (tmp_path / "site" / "sitecustomize.py").write_text(CLOCKS)
     return {"PYTHONPATH": str(tmp_path / "site"), **environment}

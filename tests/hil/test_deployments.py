@@ -19,8 +19,7 @@ WATCHDOG_S = 0.5
 PATIENT = (
     f"plant.watchdog_s={WATCHDOG_S}", f"controller.stale_s={WATCHDOG_S}", "wire.counter_bits=10", "loop.realtime=off",
 )  # fmt: skip
-SLACK_S = 0.5
-"""Beyond the watchdog: a process on a shared machine waits for hundreds of milliseconds now and then."""
+SLACK_S = 0.5  # beyond the watchdog: a process on a shared machine waits for hundreds of milliseconds now and then
 AGAIN_S = 7.0
 """Until the plant is driven again, a busy machine's 1.5 s included. TCP repeats what was lost 0.2, 0.6, 1.4, 3.0 and
 6.2 s after a cable is pulled: a grant may be received 4.2 s after the cable is back, and the next claim comes 1.25 s

@@ -57,12 +57,11 @@ def test_a_failed_test_names_its_page_events_and_output_and_a_passed_one_has_no_
 
 
 def operated(folder: Path) -> tuple[list[object], list[float]]:
-    """Operate a loop in lockstep; its changes without session names, and its figures."""
     with Hil(folder, lockstep=True) as hil:
         hil.start(settings={"reference": {"kind": "hold"}, "loop": {"rate_hz": 200}})
         hil.goto(0, 0, 0, in_s=1)  # before the first tick
         hil.run(0.5)
-        assert "turns to roll 0°, pitch -10°, yaw 20°" in hil.goto(0, -10, 20, in_s=1)
+        assert "follows roll, pitch, yaw 0°, -10°, 20°" in hil.goto(0, -10, 20, in_s=1)
         hil.run(1.0)
         assert "C2" in hil.set_gains(C2=(0.2, 0.2, 0.2))
         hil.track({"kind": "sinusoid", "amplitude": (0, 5, 5)}, in_s=2)

@@ -21,8 +21,7 @@ from aeroloop.service.testing.hil import Hil
 from aeroloop.service.testing.process_group import ProcessGroup, standalone
 from tests.support.processes import PATIENT
 
-RATE = 100
-"""Slow, so that several of these tests run beside each other: most of their time they wait."""
+RATE = 100  # slow, so that several of these tests run beside each other: most of their time they wait
 
 
 def assert_whole(logs: Path, at_least: int) -> Findings:

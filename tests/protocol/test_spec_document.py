@@ -24,7 +24,7 @@ from aeroloop.protocol.wire.transmit import Sender, Transmit
 from tests.protocol.spec_messages import section
 from tests.support.wires import wire_of
 
-SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
+SPEC: Final = (Path(protocol.__file__).parent / "SPEC.md").read_text(encoding="utf-8")
 
 QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
 KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
@@ -41,30 +41,20 @@ def cells(line: str) -> Row:
     return tuple(cell.strip().strip("`").strip() for cell in line.strip().strip("|").split("|"))
 
 
-def rows(header: str, under: str) -> list[Row]:
-    """Rows of every table with exactly this header below a heading that contains `under`."""
-    found: list[Row] = []
-    heading, inside, fenced = "", False, False
-    for line in SPEC.read_text(encoding="utf-8").splitlines():
-        if line.startswith("```"):
-            fenced = not fenced
-        elif line.startswith("#") and not fenced:
-            heading, inside = line, False
-        elif line == header and under in heading:
-            inside = True
-        elif not line.startswith("|"):
-            inside = False
-        elif inside and not set(line) <= set("|-: "):
-            found.append(cells(line))
+def rows(header: str) -> list[Row]:
+    """Rows of every table whose header begins so."""
+    lines, found = SPEC.splitlines(), list[Row]()
+    for start in (i for i, line in enumerate(lines) if line.startswith(header)):
+        found += [cells(line) for line in takewhile(lambda line: line.startswith("|"), lines[start + 2 :])]
     return found
 
 
-QUANTIZER_ROWS: Final = rows(QUANTIZER, "Golden vectors")
-KIND_ROWS: Final = rows(KINDS, "Golden vectors")
-FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
-REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
-SENT_ROWS: Final = rows(SENT, "Golden vectors")
-PUBLISHED_ROWS: Final = rows(PUBLISHED, "Topics")
+QUANTIZER_ROWS: Final = rows(QUANTIZER)
+KIND_ROWS: Final = rows(KINDS)
+FRAME_ROWS: Final = rows(FRAMES)
+REFUSED_ROWS: Final = rows(REFUSED)
+SENT_ROWS: Final = rows(SENT)
+PUBLISHED_ROWS: Final = rows(PUBLISHED)
 
 
 def number(text: str) -> int:
@@ -76,15 +66,11 @@ def number(text: str) -> int:
 
 def form(frame: str, counter_bits: str, bits: str, actuators: str) -> FrameFormat:
     """The format that the first cells of a row describe."""
-    widths = [as_bits(cell.strip()) for cell in bits.split(",")]
+    widths = [None if cell.strip() == "cont" else int(cell) for cell in bits.split(",")]
     if frame == "measurement":
         return wire_of(widths[0], widths[1], 6, counter_bits=int(counter_bits)).measurement
     assert frame == "command", f"{frame!r} is neither a measurement nor a command"
     return wire_of(8, 8, widths[0], int(actuators), int(counter_bits)).command
-
-
-def as_bits(text: str) -> int | None:
-    return None if text == "cont" else int(text)
 
 
 def test_the_golden_vectors_are_there() -> None:
@@ -188,39 +174,22 @@ def roles(cell: str) -> set[str]:
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:
-    lines = SPEC.read_text(encoding="utf-8").splitlines()
-    start = next(i for i, line in enumerate(lines) if cells(line)[0] == "topic") + 2
-    documented = [cells(line) for line in takewhile(lambda line: line.startswith("|"), lines[start:])]
-    table = {row[0]: (row[1], roles(row[3]), roles(row[4]), row[6]) for row in documented}
+    table = {row[0]: (row[1], roles(row[3]), roles(row[4]), row[6]) for row in rows("| topic | ")}
     assert table == {
-        topic.name: (
-            topic.key,
-            {*topic.senders},
-            {*topic.receivers},
-            "–" if topic.kind == "token" else size(longest(topic)),
-        )
-        for topic in TOPICS.values()
+        one.name: (one.key, {*one.senders}, {*one.receivers}, "–" if one.kind == "token" else size(longest(one)))
+        for one in TOPICS.values()
     }
 
 
 @pytest.mark.parametrize(("end", "table"), [("plant", PLANT_TABLE), ("controller", CONTROLLER_TABLE)])
 def test_the_tables_of_states_are_those_of_the_code(end: str, table: Mapping[tuple[StrEnum, StrEnum], StrEnum]) -> None:
-    lines = SPEC.read_text(encoding="utf-8").splitlines()
-    start = lines.index(f"| {end} is | what happens | {end} is then |") + 2
-    documented = list(takewhile(lambda line: line.startswith("|"), lines[start:]))
-    assert [tuple(cells(line)) for line in documented] == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
+    documented = rows(f"| {end} is | what happens | {end} is then |")
+    assert documented == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
 
 
-def test_the_text_is_of_the_version_that_a_claim_carries() -> None:
-    assert re.search(rf"^# .*version {PROTOCOL_VERSION}$", SPEC.read_text(encoding="utf-8"), re.MULTILINE)
-
-
-def test_the_causes_of_a_trip_are_numbered_as_the_text_says() -> None:
-    text = " ".join(SPEC.read_text(encoding="utf-8").split())
-    documented = text.split("Causes: ")[1].split(". >")[0]
+def test_version_causes_of_a_trip_and_every_message_are_those_of_the_code() -> None:
+    """`python -m tests.protocol.spec_messages` writes the section of the messages anew."""
+    assert re.search(rf"^# .*version {PROTOCOL_VERSION}$", SPEC, re.MULTILINE)
+    documented = " ".join(SPEC.split()).split("Causes: ")[1].split(". >")[0]
     assert documented == ", ".join(f"{number} {cause}" for number, cause in enumerate(TripCause, start=1))
-
-
-def test_every_message_stands_in_the_text_as_its_model_reads_it() -> None:
-    """`python -m tests.protocol.spec_messages` writes the section anew."""
-    assert section() in SPEC.read_text()
+    assert section() in SPEC

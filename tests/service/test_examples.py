@@ -19,6 +19,7 @@ from aeroloop.protocol.messages.models import Truth
 from aeroloop.service import examples
 from aeroloop.service.testing.hil import Hil, HilError
 from tests.support import processes
+from tests.support.failing_laws import FAILING
 from tests.support.made_log import make_log
 
 pytestmark = pytest.mark.processes
@@ -132,27 +133,27 @@ def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(folder:
 
 
 @pytest.mark.parametrize(
-    ("kind", "fault"),
+    ("failure", "fault"),
     [
-        ("Raising", "law tests.support.failing_laws:Raising: ZeroDivisionError: by nothing (failing_laws.py, line "),
-        ("Hanging", "law tests.support.failing_laws:Hanging has not ended a tick for "),
+        ("raises", ": RuntimeError: the estimator diverged (failing_laws.py, line "),
+        ("hangs", " has not ended a tick for "),
     ],
 )
-def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, kind: str, fault: str) -> None:
-    law = f"tests.support.failing_laws:{kind}"
-    hil.start(settings={"law.kind": law, "plant.truth_rate_hz": 500}, drive=False)
+def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, failure: str, fault: str) -> None:
+    kind, fault = f"{FAILING}:Failing", f"law {FAILING}:Failing{fault}"
+    hil.start(settings={"law.kind": kind, "law.failure": failure, "plant.truth_rate_hz": 500}, drive=False)
     hil.processes.start("controller")
     hil.eventually("the fault is an event", lambda: hil.happened("fault", fault))
     # It trips by the command without a value, or is released before it has read that, and then waits for a claim.
     hil.eventually("the plant is not driven", lambda: hil.state("plant") in ("tripped", "idle"))
-    if kind == "Raising":
+    if failure == "raises":
         hil.eventually(
             "the status says why",
             lambda: hil.state("controller") is not None and (hil.status("controller").cause or "").startswith(fault),
         )
         with pytest.raises(HilError, match=rf"is faulted: {re.escape(fault)}.*; `aeroloop op arm` lets it"):
             hil.set_gains(stiffness=[1.0, 1.0, 1.0])
-    assert hil.processes.stop("controller") == (1 if kind == "Hanging" else 0)
+    assert hil.processes.stop("controller") == (1 if failure == "hangs" else 0)
     truths = [truth for _, truth in hil.log.messages(Truth)]
     assert not any(truths[-1].voltages)
     assert any(any(truth.voltages) for truth in truths)

@@ -53,6 +53,12 @@ def test_the_second_half_leaves_out_what_was_before_it() -> None:
     assert found.second_half_error_deg == pytest.approx(degrees(angle(0, 0.04, 0)))
 
 
+def test_ticks_whose_measurement_was_invalid_are_not_skipped_if_a_command_answered_them() -> None:
+    """As when the sensors fail at last, and the controller goes on to command no valid value."""
+    commands = np.array([0, 1, 3, 4, 5, 6]), np.zeros((6, 2))
+    assert figures(WIRE, 0.5, (np.arange(4), np.zeros((4, 3))), commands).skipped_ticks == 1
+
+
 def test_what_is_not_available_is_null_with_its_reason() -> None:
     found = figures(WIRE, 0.5, (NONE, np.empty((0, 3))), (NONE, np.empty((0, 2))))
     names = ("z_track", "max_error_deg", "final_error_deg", "second_half_error_deg", "skipped_ticks")

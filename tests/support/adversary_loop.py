@@ -1,7 +1,8 @@
 """A second closed loop in NumPy, of many configurations at once, whose errors an adversary chooses.
 
-It takes numbers from a configuration, and nothing else of the project: body (C.1), (C.2), free or with a held roll; the
-paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag; commands that are held, late or lost.
+It takes numbers from a configuration and the reference from the twin, and nothing else of the project: body (C.1),
+(C.2), free or with a held roll; the paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag;
+commands that are held, late or lost.
 
 At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the direction of τ_d and one of the commands that
 may be in force: each the one that pushes most along a costate of the linear error equations. Beside these it chooses θ,
@@ -22,14 +23,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
+from tests.support.numpy_twin import attitude_of, motion_of
+
 Array = npt.NDArray[np.float64]
-Motion = tuple[Array, ...]
-"""q_d, and ω_d and its derivative in the desired body frame."""
+Motion = tuple[Array, ...]  # q_d, and ω_d and its derivative in the desired body frame
 QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|")
 VERTICAL: Final = np.array([0.0, 0.0, 1.0])
 END_S: Final = 100 * 86_400.0
-_AT_ONCE: Final = 1e-3
-"""Lag of rotors in the costates of a body without any [s]."""
+_AT_ONCE: Final = 1e-3  # lag of rotors in the costates of a body without any [s]
 
 
 def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: float = 0.0) -> dict[str, Any]:
@@ -55,66 +56,45 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
 
 
 def rows_of(known: list[dict[str, Any]], rows: int = 1) -> Any:
-    """Constants of experiments, so many of each configuration."""
     together = {name: np.array([one[name] for one in known], dtype=float) for name in known[0]}
     return SimpleNamespace(**{name: np.repeat(each, rows, axis=0) for name, each in together.items()})
 
 
 def cross(a: Array, b: Array) -> Array:
     (x, y, z), (u, v, w) = ((each[..., 0], each[..., 1], each[..., 2]) for each in (a, b))
-    found: Array = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
-    return found
+    return np.asarray(np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1))
 
 
 def dot(a: Array, b: Array) -> Array:
-    product: Array = (a * b).sum(axis=-1, keepdims=True)
-    return product
+    return np.asarray((a * b).sum(axis=-1, keepdims=True))
 
 
 def norm(v: Array) -> Array:
-    length: Array = np.sqrt((v * v).sum(axis=-1))
-    return length
+    return np.asarray(np.sqrt((v * v).sum(axis=-1)))
 
 
 def unit(v: Array) -> Array:
-    direction: Array = v / np.maximum(norm(v)[..., None], 1e-300)
-    return direction
+    return np.asarray(v / np.maximum(norm(v)[..., None], 1e-300))
 
 
 def by(matrix: Array, v: Array) -> Array:
-    product: Array = np.einsum("rij,rj->ri", matrix, v)
-    return product
+    return np.asarray(np.einsum("rij,rj->ri", matrix, v))
 
 
 def to_body(q: Array, v: Array) -> Array:
-    """Rᵀ(q) v."""
     t = 2 * cross(q[..., 1:], v)
-    found: Array = v - q[..., :1] * t + cross(q[..., 1:], t)
-    return found
+    return np.asarray(v - q[..., :1] * t + cross(q[..., 1:], t))
 
 
 def times(p: Array, q: Array) -> Array:
-    """p ∘ q."""
     (a, b), (s, v) = (p[..., :1], p[..., 1:]), (q[..., :1], q[..., 1:])
     return np.concatenate([a * s - dot(b, v), a * v + s * b + cross(b, v)], axis=-1)
 
 
-def attitude_of(angle: Array) -> Array:
-    """q of roll, pitch and yaw, of which yaw turns first."""
-    (a, b, c), (r, p, y) = np.cos(angle / 2).T, np.sin(angle / 2).T
-    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
-
-
 def desired(c: Any, t: Array) -> Motion:
-    """The reference at times t, one a row."""
     turn = c.frequency * t[:, None]
     angle, rate = c.amplitude * np.sin(turn), c.amplitude * c.frequency * np.cos(turn)
-    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = angle.T, rate.T, (-(c.frequency**2) * angle).T
-    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
-    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
-    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=1)
-    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[:, 2], across_dot * cr - ddp * sr - dr * omega[:, 1]
-    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=1)
+    return motion_of(angle, rate, -(c.frequency**2) * angle)
 
 
 def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
@@ -125,7 +105,6 @@ def errors(q: Array, omega: Array, now: Motion) -> tuple[Array, ...]:
 
 
 def drift(c: Any, q: Array, omega: Array) -> Array:
-    """Ψ: what the body turns by without command and damping."""
     return cross(c.r_g, to_body(q, c.weight)) - cross(omega, c.J * omega)
 
 
@@ -145,14 +124,11 @@ def adapted(c: Any, theta: Array, omega: Array, z2: Array) -> Array:
     passed, outward = (dot(moved, moved) - c.radius**2) / (outer**2 - c.radius**2), dot(moved, tau)
     along = c.Gamma * moved / np.maximum(dot(moved, c.Gamma * moved), 1e-300)
     moved = moved + c.T * (tau - (passed > 0) * (outward > 0) * np.minimum(passed, 1) * outward * along)
-    after: Array = c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300))
-    return after
+    return np.asarray(c.centre + moved * np.minimum(1, outer / np.maximum(norm(moved)[:, None], 1e-300)))
 
 
 def rotor_lag(c: Any, V: Array, u: Array) -> Array:
-    """Each rotor's time constant now [s]."""
-    lag: Array = np.where((u - V) * V >= 0, c.up, c.down)
-    return lag
+    return np.asarray(np.where((u - V) * V >= 0, c.up, c.down))
 
 
 def held_axis(q: Array) -> Array:

@@ -114,7 +114,6 @@ def _packed(folder: Path, description: str, files: dict[str, Path]) -> Path:
 
 
 def altered(fmu: Path, path: Path, *edits: tuple[str, str], files: tuple[str, str] = ("", "")) -> Path:
-    """A copy with other words in its description, and with other names of its files."""
     with ZipFile(fmu) as old, ZipFile(path, "w", ZIP_DEFLATED) as new:
         for name in old.namelist():
             content = old.read(name)

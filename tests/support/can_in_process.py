@@ -10,7 +10,6 @@ import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any, Self
 
 import can
@@ -26,7 +25,6 @@ PAPER = WireSpec()
 
 
 def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> CanSettings:
-    """A bus of this process, on a channel of its own unless one is given."""
     return CanSettings(interface="virtual", channel=channel or uuid.uuid4().hex, fd=fd, node=node)
 
 
@@ -41,18 +39,14 @@ class Stranger:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bus.shutdown()
 
     def say(self, identifier: int, data: bytes, **how: Any) -> None:
-        """Send a frame; FD if it is longer than a classic one."""
         kind: dict[str, Any] = {"is_extended_id": False, "is_fd": len(data) > 8, **how}
         self._bus.send(can.Message(arbitration_id=identifier, data=data, **kind))
 
     def receive(self, wanted: Callable[[can.Message], bool] = lambda _: True) -> can.Message:
-        """The next frame that is wanted; the others are thrown away."""
         while True:
             message = self._bus.recv(PATIENCE_S)
             assert message is not None, f"nothing of the kind came within {PATIENCE_S:g} s"
@@ -79,7 +73,6 @@ class Flaws:
         self.opened = self.sent = 0
 
     def bus(self, channel: str, **options: Any) -> FlawedBus:
-        """As `can.Bus`, of the virtual interface."""
         self.opened += 1
         if self.gone:
             raise can.CanInitializationError(f"could not open {channel}:\nno such device")
@@ -109,7 +102,6 @@ class FlawedBus(VirtualBus):
 
 @contextmanager
 def both_ends(settings: CanSettings, wire: WireSpec = PAPER) -> Iterator[tuple[CanLink, CanLink, Stranger]]:
-    """The plant's link, the controller's, and a stranger that reads the bus as it is."""
     plant, controller = CanLink(settings, wire, "plant"), CanLink(settings, wire, "controller")
     try:
         with Stranger(settings) as stranger:

@@ -16,8 +16,7 @@ FREE: Final = (
     "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]",
     "law.centre_of_mass=[0, 0, 0]",
     "law.damping_bound=0.0119",
-)
-"""The paper's inertia, gains and reference; nothing beyond (C.1) and (C.2); θ within the first estimate's norm."""
+)  # the paper's inertia, gains and reference; nothing beyond (C.1) and (C.2); θ within the first estimate's norm
 
 
 def bits(out: int | None, inp: int | None) -> list[str]:

@@ -20,13 +20,11 @@ MARKER: Final = "marker"
 MESSAGES: Final = (
     *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
     *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
-)
-"""Every kind that Zenoh's rules tell apart."""
+)  # every kind that Zenoh's rules tell apart
 _BY: Final = zenoh.Locality.REMOTE
 
 
 def tls(certificate: Path) -> dict[str, Any]:
-    """Zenoh's settings of TLS with a certificate, with its key and its authority beside it."""
     own, key = str(certificate), str(certificate.with_suffix(".key"))
     return {
         "root_ca_certificate": str(certificate.with_name("ca.pem")),
@@ -45,7 +43,6 @@ def open_session(
     access: dict[str, Any] | None = None,
     mode: str = "peer",
 ) -> zenoh.Session:
-    """Open a session with a certificate, and with access rules, if any."""
     tree = {
         "mode": mode,
         "listen": {"endpoints": list(listen)},
@@ -72,8 +69,6 @@ def with_marker(access: dict[str, Any], *, egress_open: bool = False) -> dict[st
 
 
 class Pair(NamedTuple):
-    """Two linked sessions."""
-
     guard: zenoh.Session
     hand: zenoh.Session
 

@@ -10,15 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import (
-    Event,
-    Loss,
-    Percentiles,
-    Status,
-    Telemetry,
-    Timing,
-    Truth,
-)
+from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status, Telemetry, Timing, Truth
 from aeroloop.protocol.messages.operator import Setpoint
 from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.protocol.messages.trace import Received as ReceivedAs
@@ -42,7 +34,6 @@ def quaternion_of(turn: Rotation) -> Quaternion:
 
 
 def about(axis: int, by: float) -> Rotation:
-    """A turn about a body axis 1, 2 or 3 [rad]."""
     return Rotation.from_rotvec(by * np.eye(3)[axis - 1])
 
 
@@ -51,7 +42,6 @@ ATTITUDE = quaternion_of(BODY)
 
 
 def address(name: str, role: str = "plant") -> topics.Address:
-    """Where a message of this name was received."""
     found = topics.read_key(topics.key(name, "aero", session="s1", role=role))
     assert found is not None
     return found
@@ -65,12 +55,10 @@ def configured(rate_hz: float | None = None) -> Decoder:
 
 
 def frame(form: FrameFormat, quantizers: list[Quantizer], values: list[float | None]) -> bytes:
-    """A frame of values; None where there is no valid one."""
     return form.pack(3, [q.invalid if v is None else q.encode(v) for q, v in zip(quantizers, values, strict=True)])
 
 
 def measurement(*values: float | None) -> bytes:
-    """A measurement of attitude and rate."""
     quantizers = [WIRE.attitude.quantizer()] * 3 + [WIRE.rate.quantizer()] * 3
     return frame(WIRE.measurement, quantizers, list(values))
 
@@ -93,20 +81,17 @@ def batch(end: End, rows: list[tuple[int, Sent, bytes]], wire: WireSpec = WIRE) 
 
 
 def by_topic(decoded: list[Decoded]) -> dict[str, Decoded]:
-    """Decoded messages, one of each topic."""
     found = {message.topic: message for message in decoded}
     assert len(found) == len(decoded)
     return found
 
 
 def said(decoded: Decoded) -> dict[str, Any]:
-    """What a JSON message says."""
     tree: dict[str, Any] = json.loads(decoded.data)
     return tree
 
 
 def telemetry(error: Quaternion, sign: int = 1) -> Telemetry:
-    """Telemetry with this attitude error."""
     return Telemetry(
         session="s1", tick=250, counter=3, attitude_error=error[1:], rate_error=(0.0, radians(2.0), radians(-3.0)),
         desired=ATTITUDE, state={"damping_estimate": (0.0, 0.007, 0.0095), "sign": (sign,)}, voltages=(1.0, 2.0),
@@ -130,5 +115,4 @@ RAW = {
     "event": Event(role="plant", kind="started", text="x").encode(),
     "loss": Loss(key="k", count=1, reason="cache").encode(),
     "trace": batch("plant", [(NOW, Sent.FRAME, measurement(0, 0, 0, 0, 0, 0))]),
-}
-"""A message of every topic that is decoded."""
+}  # a message of every topic that is decoded

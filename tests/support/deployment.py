@@ -24,10 +24,8 @@ from tests.support.namespaces import RECOVERY_S, STOP_WAIT_S, Hosts, Ways
 from tests.support.zenoh_network import eventually
 
 Kind = Literal["peers", "router"]
-HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")
-"""In the order of their addresses."""
-AWAY_S: Final = 2.0
-"""Twice the lease, so that links are given up [s]."""
+HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")  # in the order of their addresses
+AWAY_S: Final = 2.0  # twice the lease, so that links are given up [s]
 
 
 class Outcome(NamedTuple):
@@ -61,12 +59,10 @@ class Deployment(Hosts):
         self._finished = float("inf")  # when the daemons are ended [s since 1970]: what that costs is no trouble's
 
     def options(self, overrides: Sequence[str] = ()) -> list[str]:
-        """As of any hosts, with certificates for the example's."""
         return super().options([f"network.security.directory={self._keys.folder}", *overrides])
 
     @property
     def network(self) -> NetworkSettings:
-        """As of any hosts, with certificates for the example's."""
         return super().network.model_copy(
             update={"security": SecuritySettings(directory=str(self._keys.folder), vehicles=["aero"])}
         )
@@ -110,17 +106,14 @@ class Deployment(Hosts):
         self.suffer(title, partial(self.lose, "plant", percent, ways), partial(self.lose, "plant", 0), for_s)
 
     def slow(self, kbit_per_s: int, for_s: float) -> None:
-        """Limit what the plant sends and what it receives for a time."""
         title = f"{kbit_per_s} kbit/s to and from the plant"
         self.suffer(title, partial(self.narrow, "plant", kbit_per_s, "both"), partial(self.plug, "plant"), for_s)
 
     def choke(self, host: str, kbit_per_s: int, for_s: float) -> None:
-        """Limit what a host receives for a time."""
         title = f"{kbit_per_s} kbit/s to the {host}"
         self.suffer(title, partial(self.narrow, host, kbit_per_s), partial(self.plug, host), for_s)
 
     def halt(self, host: str, for_s: float = AWAY_S) -> None:
-        """Halt a daemon for a time."""
         halted, goes_on = (partial(self.daemons[host].send_signal, which) for which in (signal.SIGSTOP, signal.SIGCONT))
         self.suffer(f"the {host} halted for {for_s:g} s", halted, goes_on, for_s)
 

@@ -62,7 +62,6 @@ def message_of(
 
 
 def contents(log: Path) -> tuple[list[Said], list[tuple[str, dict[str, str]]]]:
-    """Messages of a whole log in order of time, and its metadata."""
     with log.open("rb") as file:
         reader = make_reader(file)
         messages = [
@@ -133,8 +132,6 @@ def at_rest(k: Sequence[int] | npt.NDArray[np.int64], **columns: Any) -> Ticks:
 
 
 class Part(NamedTuple):
-    """A record as it stands in the file."""
-
     offset: int
     opcode: int
     content: bytes
@@ -145,8 +142,6 @@ class Part(NamedTuple):
 
 
 class Read(NamedTuple):
-    """A message as it stands in a file."""
-
     topic: str
     sequence: int
     log_time: int
@@ -178,7 +173,6 @@ def with_a_damaged_chunk(whole: Path, out: Path, which: int | None = None) -> Pa
 
 
 def by_mcap(path: Path) -> list[Read]:
-    """Every message of a whole file, as mcap's own reader has them by the index."""
     with path.open("rb") as file:
         return [
             Read(channel.topic, one.sequence, one.log_time, one.publish_time, one.data)

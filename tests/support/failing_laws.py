@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
@@ -19,24 +18,19 @@ Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape"]
 
 
 class FailingSettings(LawSettings):
-    """What shall go wrong."""
-
-    failure: Failure = Field(default="raises", description="what goes wrong")
+    failure: Failure | Literal["hangs"] = Field(default="raises", description="what goes wrong")
     at: int = Field(default=3, description="at which tick")
 
 
 class Failing(PythonLaw[FailingSettings]):
-    """Counts its ticks, and fails at one of them."""
-
     Settings = FailingSettings
 
     def reset(self) -> None:
-        self.state = {"ticks": np.zeros(1)}
+        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
 
     def step(self, now: Now[Floats]) -> Any:
-        del now
-        k = int(self.state["ticks"][0])
-        self.state["ticks"] += 1
+        k = int(now.state["ticks"][0])
+        self.state["ticks"] = now.state["ticks"] + 1
         if k != self.settings.at:
             return [1.0] * self.actuators
         match self.settings.failure:
@@ -48,18 +42,17 @@ class Failing(PythonLaw[FailingSettings]):
                 return [1.0]
             case "another shape":
                 self.state["ticks"] = np.zeros(2)
+            case "hangs":
+                while True:
+                    pass
         return [1.0] * self.actuators
 
 
 class MistakenSettings(LawSettings):
-    """Which of a beginner's mistakes is made."""
-
     mistake: Literal["width", "state", "no such vector"] = Field(description="what is wrong with it")
 
 
 class Mistaken(ExpressionLaw[MistakenSettings]):
-    """Expressions that cannot be built."""
-
     Settings = MistakenSettings
 
     def initial(self) -> Mapping[str, Sequence[float]]:
@@ -78,8 +71,6 @@ class Mistaken(ExpressionLaw[MistakenSettings]):
 
 
 class Picky(PythonLaw[LawSettings]):
-    """Cannot be made."""
-
     Settings = LawSettings
 
     def __init__(self, settings: LawSettings, period: float, actuators: int) -> None:
@@ -94,45 +85,10 @@ class Picky(PythonLaw[LawSettings]):
 
 
 class Runaway(ExpressionLaw[LawSettings]):
-    """Pushes where it should pull."""
-
     Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
-
-
-class FourthTick(PythonLaw[LawSettings]):
-    """Gives 1 V, and calls `fail` at its fourth tick and every later one."""
-
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
-
-    def step(self, now: Now[Any]) -> Any:
-        self.state["ticks"] = now.state["ticks"] + 1
-        if now.state["ticks"] > 2:
-            self.fail()
-        return [1.0] * self.actuators
-
-    @abstractmethod
-    def fail(self) -> None: ...
-
-
-class Raising(FourthTick):
-    """Fails."""
-
-    def fail(self) -> None:
-        raise ZeroDivisionError("by nothing")
-
-
-class Hanging(FourthTick):
-    """Never ends."""
-
-    def fail(self) -> None:
-        while True:
-            pass
 
 
 class NoLaw:

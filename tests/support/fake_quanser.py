@@ -36,8 +36,7 @@ Kind = Literal["analog", "digital"]
 _OUTPUTS: Final[dict[Kind, tuple[range, Any, Any, float, float]]] = {
     "analog": (range(2), np.float64, np.float64, -24.0, 24.0),  # voltages of the motors [V]
     "digital": (range(2), np.int8, np.int32, 0, 1),  # amplifiers of the motors
-}
-"""Channels, types of the values written and of those at expiry, least and largest value."""
+}  # channels, types of the values written and of those at expiry, least and largest value
 
 
 class MisuseError(AssertionError):
@@ -45,8 +44,6 @@ class MisuseError(AssertionError):
 
 
 class HILError(Exception):
-    """The board refuses a call or fails."""
-
     def get_error_message(self) -> str:
         return str(self.args[0])
 
@@ -133,7 +130,6 @@ class FakeQuanser:
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
-        """Let periods pass in which nobody reads."""
         for _ in range(periods):
             self.step()
 
@@ -190,7 +186,6 @@ class FakeQuanser:
             self.restore(self.at_expiry)
 
     def _due_ns(self) -> int:
-        """Time of the next sample, on `time.monotonic_ns()`."""
         return self.started_ns + round((self.time + 1) * self.period * 1e9)
 
     def _count(self) -> None:
@@ -425,7 +420,6 @@ def _array(array: Any, dtype: type[np.generic], n: int) -> None:
 def _inputs(
     analog: Any, n_analog: int, encoders: Any, n_encoders: int, digital: Any, n_digital: int, other: Any, n_other: int
 ) -> tuple[list[int], list[int]]:
-    """Numbers of the encoder and the other channels to read."""
     unread = analog is None and not n_analog and digital is None and not n_digital
     _require(unread, "the fake reads encoders and other channels only")
     return _numbers(encoders, n_encoders, _ENCODERS), _numbers(other, n_other, _GYRO)

@@ -14,8 +14,6 @@ from aeroloop.service.lab.engine import Workers
 
 
 class InThisProcess(Executor):
-    """Runs what is submitted at once."""
-
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
         future: Future[Any] = Future()
         try:
@@ -36,5 +34,4 @@ def _here() -> Iterator[Workers]:
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let studies run in this process instead of on every core."""
     monkeypatch.setattr(engine, "local_processes", _here)

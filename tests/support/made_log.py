@@ -18,7 +18,7 @@ from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
 from aeroloop.protocol.messages.trace import ControllerRow, End, Outcome, Received, Sent, TraceWriter
 from aeroloop.protocol.transport.history import Delivery as Message
@@ -30,23 +30,21 @@ from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording.log_file import LogFile
+from tests.support.plant_end import claim_of
 
-START_NS: Final = 1_800_000_000_000_000_000
-"""When tick 0 is measured, on the plant's wall clock."""
+START_NS: Final = 1_800_000_000_000_000_000  # when tick 0 is measured, on the plant's wall clock
 VEHICLE, SESSION = "aero", "s1"
 MONOTONIC_NS: Final[dict[End, int]] = {"plant": 3_600_000_000_000, "controller": 86_400_000_000_000}
 """The same instant on either end's monotonic clock: they were booted at different times."""
-AHEAD_NS: Final = 10_000_000_000
-"""The controller's wall clock is so far ahead of the plant's."""
-ONE_WAY_NS: Final = 150_000
-"""What a frame takes either way, where nothing goes wrong."""
+AHEAD_NS: Final = 10_000_000_000  # of the controller's wall clock to the plant's
+ONE_WAY_NS: Final = 150_000  # what a frame takes either way, where nothing goes wrong
 RUNS: Final[dict[End, int]] = {"plant": 0x1111, "controller": 0x2222}
 
 Changes = dict[int, tuple[Gains | None, Reference | None]]
 
 
-def lockstep() -> Settings:
-    return load(overrides=["loop.lockstep=true"])
+def lockstep(*overrides: str) -> Settings:
+    return load(overrides=["loop.lockstep=true", *overrides])
 
 
 class Clock:
@@ -59,7 +57,6 @@ class Clock:
         self._rate = 1.0 + drift
 
     def at(self, now_ns: int) -> int:
-        """Its monotonic clock at an instant [ns]."""
         return self._monotonic_ns + round(now_ns * self._rate)
 
     def monotonic_ns(self) -> int:
@@ -85,8 +82,6 @@ class Logged(NamedTuple):
 
 
 class Messages:
-    """What is to be recorded, in order."""
-
     def __init__(self) -> None:
         self.all: list[Logged] = []
 
@@ -174,26 +169,17 @@ class ControllerEnd:
 
 @dataclass
 class Rough:
-    """A loop in which much goes otherwise, by chance, and what happened in it.
-
-    Attributes:
-        measured: Frames that the plant made, by session tick; UNCHANGED where it sent none.
-        commands: What the controller sent at each tick that it computed.
-        late: Measurements that came late.
-        acted: When the plant received the command that it acted on, on its clock, by the tick that it answers [ns].
-        sent: When the measurement of a tick was sent, on the plant's clock [ns].
-        outcomes: Of the plant's ticks, in order.
-    """
+    """A loop in which much goes otherwise, by chance, and what happened in it. Times are on the plant's clock [ns]."""
 
     settings: Settings
     chance: random.Random
     messages: list[Logged] = field(default_factory=list)
-    measured: dict[int, bytes] = field(default_factory=dict)
-    commands: dict[int, bytes | None] = field(default_factory=dict)
-    late: int = 0
-    acted: dict[int, int] = field(default_factory=dict)
-    sent: dict[int, int] = field(default_factory=dict)
-    outcomes: list[Outcome] = field(default_factory=list)
+    measured: dict[int, bytes] = field(default_factory=dict)  # the plant's frames by tick; UNCHANGED where it sent none
+    commands: dict[int, bytes | None] = field(default_factory=dict)  # of each tick that the controller computed
+    late: int = 0  # measurements that came late
+    acted: dict[int, int] = field(default_factory=dict)  # when the command acted on was received, by the tick answered
+    sent: dict[int, int] = field(default_factory=dict)  # when the measurement of a tick was sent
+    outcomes: list[Outcome] = field(default_factory=list)  # of the plant's ticks, in order
 
     def happens(self, share: float) -> bool:
         return self.chance.random() < share
@@ -244,28 +230,18 @@ def made(
     ticks: int,
     changes: Changes = {},  # noqa: B006  # never changed
     *,
-    truth_every: int = 0,
-    lost: Container[int] = (),
-    skipped: Container[int] = (),
+    truth_every: int = 0,  # ticks; 0 is never
+    lost: Container[int] = (),  # ticks whose measurement never reaches the controller
+    skipped: Container[int] = (),  # ticks that the plant has no time for
     session: str = SESSION,
-    at_ns: int = 0,
-    injected: Mapping[int, str | None] = {},
-    rough: Rough | None = None,
+    at_ns: int = 0,  # when it begins, after the first instant of both clocks
+    injected: Mapping[int, str | None] = {},  # faults, before a tick; None clears all
+    rough: Rough | None = None,  # notes what goes otherwise by chance
 ) -> list[Logged]:
-    """The messages of a loop in which nothing else goes wrong; each session is of processes of its own.
+    """The messages of a loop in which nothing else goes wrong, with an operator's changes by tick.
 
-    Args:
-        settings: Its configuration.
-        ticks: How many ticks it runs.
-        changes: Gains and reference that an operator sets, by tick.
-        truth_every: Publish the true state every so many ticks; 0 is never.
-        lost: Ticks whose measurement never reaches the controller.
-        skipped: Ticks that the plant has no time for.
-        session: Its name.
-        at_ns: When it begins, after the first instant of both clocks [ns].
-        injected: Faults that are injected before a tick; None clears all. With faults, injected or configured, the
-            plant also publishes events, and a status every 100 ticks.
-        rough: Notes what goes otherwise by chance.
+    Each session is of processes of its own. With faults, injected or configured, the plant also publishes events, and a
+    status every 100 ticks.
     """
     wire, loop = settings.wire, settings.loop
     messages = Messages()
@@ -275,7 +251,6 @@ def made(
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
 
     def publish(k: int) -> None:
-        """Events and a status of the plant."""
         for notice in endpoint.notices:
             messages.add("event", Event(role="plant", **notice._asdict()).encode(), plant_clock, "plant")
         endpoint.notices.clear()
@@ -289,9 +264,7 @@ def made(
     trace = PlantTrace(
         wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n, plant_clock
     )
-    claim = Claim(
-        controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
-    )
+    claim = claim_of("c", wire=wire, period_ns=loop.period_ns, lockstep=loop.lockstep, session=session)
     assert isinstance(endpoint.claim(claim), Grant)
     trace.follow(endpoint)
     end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)

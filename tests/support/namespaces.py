@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Literal, Self
 
 import zenoh
@@ -74,9 +73,7 @@ class Hosts:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for process in reversed(self._processes):
             for which in (signal.SIGTERM, signal.SIGCONT):
                 process.send_signal(which)
@@ -100,7 +97,6 @@ class Hosts:
         return [*(["--config", str(self._config)] if self._config else []), *sets]
 
     def output(self, host: str, *words: str) -> str:
-        """What a command of the program prints on a host. Raises subprocess.CalledProcessError."""
         command = ["ip", "netns", "exec", self._prefix + host, sys.executable, "-m", "aeroloop", *words]
         return subprocess.run([*command, *self.options()], check=True, capture_output=True, text=True).stdout
 
@@ -112,7 +108,6 @@ class Hosts:
         stdout: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> subprocess.Popen[bytes]:
-        """Start this Python on a host, with additions to the environment."""
         command = ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
         with self.log(host).open("ab") as errors, (stdout or Path(os.devnull)).open("ab") as output:
             inherited = {**os.environ, "STATE_DIRECTORY": str(self._folder / "state")}
@@ -133,7 +128,6 @@ class Hosts:
 
     @property
     def network(self) -> NetworkSettings:
-        """The network of the configuration, or without one the rendezvous in plain text."""
         configured = load_target(self._config).network if self._config else None
         return configured or NetworkSettings(rendezvous=self.rendezvous, insecure=True)
 
@@ -175,7 +169,6 @@ class Hosts:
         return found["rx"]["bytes"], found["tx"]["bytes"]
 
     def _ends(self, host: str) -> tuple[tuple[str, str], tuple[str, str]]:
-        """Namespace and device at both ends of a host's cable, the switch's first."""
         return (self._switch, host), (self._prefix + host, "cable")
 
     def _remove(self) -> None:

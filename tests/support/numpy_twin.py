@@ -11,6 +11,7 @@ Vectors have shape (3,), quaternions (4,) with the scalar first.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TypeAlias
 
 import numpy as np
@@ -59,25 +60,10 @@ class Body:
     centre: Array
 
 
-@dataclass(frozen=True)
-class LawState:
-    """What the law computes on its way, by the paper's letters."""
-
-    e: Array
-    omega_e: Array
-    z1: Array
-    z2: Array
-    alpha: Array
-    alpha_bar: Array
-    u: Array
-    tau: Array
-    theta_dot: Array
-
-
 def law(
     p: Body, q: Array, omega: Array, q_d: Array, omega_d: Array, omega_d_dot: Array, theta: Array, s: float
-) -> LawState:
-    """(C.37) and (C.38) with all that they need; s is the upper (+1) or lower (−1) sign of the paper's ±."""
+) -> SimpleNamespace:
+    """(C.37), (C.38) and all on their way, by the paper's letters; s is the upper (+1) or lower (−1) sign of its ±."""
     eta, eps, eta_d, eps_d = q[0], q[1:], q_d[0], q_d[1:]
     e = np.empty(4)
     e[0] = eta_d * eta + eps_d @ eps  # (C.32)
@@ -98,7 +84,10 @@ def law(
     feedforward = np.cross(omega, R_i_Q @ omega_d) - R_i_Q @ omega_d_dot - alpha_bar
     u = np.linalg.inv(p.B) @ (-G @ z1 - p.C2 @ z2 - Phi @ theta - Psi - p.J @ feedforward)  # (C.37)
     tau = p.Gamma @ Phi @ z2
-    return LawState(e, omega_e, z1, z2, alpha, alpha_bar, u, tau, projected(p, theta, tau))
+    theta_dot = projected(p, theta, tau)
+    return SimpleNamespace(
+        e=e, omega_e=omega_e, z1=z1, z2=z2, alpha=alpha, alpha_bar=alpha_bar, u=u, tau=tau, theta_dot=theta_dot
+    )
 
 
 def projected(p: Body, theta: Array, tau: Array) -> Array:
@@ -115,6 +104,22 @@ def projected(p: Body, theta: Array, tau: Array) -> Array:
     return tau - removed
 
 
+def motion_of(angle: Array, rate: Array, acceleration: Array) -> tuple[Array, Array, Array]:
+    """q_d of roll, pitch and yaw, of which yaw turns first, and ω_d and ω̇_d in the desired body frame. (…, 3)."""
+    (r, p, _), (dr, dp, dy), (ddr, ddp, ddy) = (np.moveaxis(each, -1, 0) for each in (angle, rate, acceleration))
+    sr, cr, sp, cp = np.sin(r), np.cos(r), np.sin(p), np.cos(p)
+    across, across_dot = dy * cp, ddy * cp - dy * dp * sp
+    omega = np.stack([dr - dy * sp, dp * cr + across * sr, across * cr - dp * sr], axis=-1)
+    of_y, of_z = ddp * cr + across_dot * sr + dr * omega[..., 2], across_dot * cr - ddp * sr - dr * omega[..., 1]
+    return attitude_of(angle), omega, np.stack([ddr - ddy * sp - dy * dp * cp, of_y, of_z], axis=-1)
+
+
+def attitude_of(angle: Array) -> Array:
+    """q of roll, pitch and yaw. Shapes (…, 3), (…, 4)."""
+    (a, b, c), (r, p, y) = (np.moveaxis(each(angle / 2), -1, 0) for each in (np.cos, np.sin))
+    return np.stack([a * b * c + r * p * y, r * b * c - a * p * y, a * p * c + r * b * y, a * b * y - r * p * c], -1)
+
+
 @dataclass(frozen=True)
 class Sinusoids:
     """amplitude · sin(frequency · t) on roll, pitch and yaw. [rad], [rad/s]."""
@@ -123,53 +128,23 @@ class Sinusoids:
     frequency: Array
 
     def angles(self, t: float) -> tuple[Array, Array, Array]:
-        """The angles and their first and second derivatives."""
         a, w = self.amplitude, self.frequency
         return a * np.sin(w * t), a * w * np.cos(w * t), -a * w * w * np.sin(w * t)
 
     def desired(self, t: float) -> tuple[Array, Array, Array]:
-        """q_d, ω_d and ω̇_d, the last two in the inertial frame.
-
-        The axes of the three turns, seen from the inertial frame, are: yaw z; pitch the y axis turned by the yaw;
-        roll the x axis turned by yaw and pitch. ω_d is the sum of each rate times its axis, ω̇_d its derivative.
-        """
-        (r, p, y), (dr, dp, dy), (ddr, ddp, ddy) = self.angles(t)
-        a, b, c = r / 2, p / 2, y / 2
-        q_d = np.array(
-            [
-                np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c),
-                np.sin(a) * np.cos(b) * np.cos(c) - np.cos(a) * np.sin(b) * np.sin(c),
-                np.cos(a) * np.sin(b) * np.cos(c) + np.sin(a) * np.cos(b) * np.sin(c),
-                np.cos(a) * np.cos(b) * np.sin(c) - np.sin(a) * np.sin(b) * np.cos(c),
-            ]
-        )
-        sp, cp, sy, cy = np.sin(p), np.cos(p), np.sin(y), np.cos(y)
-        omega_d = np.array([-sy * dp + cy * cp * dr, cy * dp + sy * cp * dr, dy - sp * dr])
-        omega_d_dot = np.array(
-            [
-                -cy * dy * dp - sy * ddp - (sy * dy * cp + cy * sp * dp) * dr + cy * cp * ddr,
-                -sy * dy * dp + cy * ddp + (cy * dy * cp - sy * sp * dp) * dr + sy * cp * ddr,
-                ddy - cp * dp * dr - sp * ddr,
-            ]
-        )
-        return q_d, omega_d, omega_d_dot
+        """q_d, ω_d and ω̇_d, the last two in the inertial frame."""
+        q_d, omega, omega_dot = motion_of(*self.angles(t))
+        return q_d, rotation(q_d) @ omega, rotation(q_d) @ omega_dot
 
 
 @dataclass
 class LockedBody:
-    """A rigid body on the Aero's mechanism, by (C.2) plus the torque that holds its roll.
-
-    Attributes:
-        body: J, m, g and r_g; the gains are not used.
-        thrust: Torque of two motors about three axes [N·m/V]. Shape (3, 2).
-        damping: θ [N·m·s/rad].
-        x: [pitch, yaw, their rates] in rad and rad/s.
-    """
+    """A rigid body on the Aero's mechanism, by (C.2) plus the torque that holds its roll."""
 
     body: Body
-    thrust: Array
-    damping: Array
-    x: Array
+    thrust: Array  # torque of two motors about three axes [N·m/V]. Shape (3, 2)
+    damping: Array  # θ [N·m·s/rad]
+    x: Array  # pitch, yaw [rad], their rates [rad/s]
 
     @property
     def q(self) -> Array:
@@ -179,7 +154,6 @@ class LockedBody:
 
     @property
     def omega(self) -> Array:
-        """ω in the body frame."""
         p, _, dp, dy = self.x
         return np.array([-np.sin(p) * dy, dp, np.cos(p) * dy])
 

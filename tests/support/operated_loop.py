@@ -35,14 +35,12 @@ PERIOD = 0.002
 LAW = AdaptiveSettings()
 LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
 SWING = Sinusoid(amplitude=(0.0, 5.0, 20.0), frequency=(0.0, 0.5, 0.4))
-CONFIGURED = ControllerSettings(after_restart="configured")
-"""Which session begins with what: test_session_start.py."""
+CONFIGURED = ControllerSettings(after_restart="configured")  # which session begins with what: test_session_start.py
 WIRE = WireSpec(
     attitude=SignalSpec(bits=None, limit=1.0),
     rate=SignalSpec(bits=None, limit=5.0),
     voltage=SignalSpec(bits=None, limit=1e9),
-)
-"""Unquantized and hardly limited: a command says the last bit of what the law computes."""
+)  # unquantized and hardly limited: a command says the last bit of what the law computes
 AT_REST = [0.0] * 6
 M = TypeVar("M", bound=Message)
 
@@ -53,7 +51,6 @@ def measured(k: int, codes: list[float] | None = None) -> bytes:
 
 
 def turned(yaw: float) -> list[float]:
-    """The codes of a body at rest that has yawed [deg]."""
     attitude, rate = WIRE.attitude.quantizer(), WIRE.rate.quantizer()
     return [*(attitude.encode(x) for x in (0.0, 0.0, sin(radians(yaw) / 2))), *(rate.encode(0.0) for _ in range(3))]
 
@@ -78,8 +75,6 @@ class Query:
 
 
 class Network:
-    """A Zenoh session without any other: it keeps what is declared and what is put."""
-
     def __init__(self) -> None:
         self.put: list[tuple[str, bytes]] = []
         self.queryables: dict[str, Callable[[Any], None]] = {}
@@ -99,8 +94,6 @@ class Network:
 
 
 class LonelyNode(Node):
-    """A role whose publications stay on the network of the test."""
-
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         del per_s, lossless
         network: Any = self.zenoh
@@ -112,11 +105,7 @@ class LonelyNode(Node):
 class Loop:
     """What the daemon does around OperatorChanges; `log` has each session's ticks, measurements and commands."""
 
-    def __init__(
-        self,
-        reference: Reference,
-        settings: ControllerSettings = CONFIGURED,
-    ) -> None:
+    def __init__(self, reference: Reference, settings: ControllerSettings = CONFIGURED) -> None:
         self.clock = FakeClock()
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
@@ -132,7 +121,6 @@ class Loop:
         self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}
 
     def fresh(self, reference: Reference | None = None) -> Controller:
-        """A controller as the configuration makes it, or with another reference."""
         return Controller(WIRE, LAW, reference or self.configured, PERIOD)
 
     # The loop
@@ -162,14 +150,12 @@ class Loop:
             self.tick()
 
     def malformed(self) -> None:
-        """Something comes that is no measurement; the daemon counts it as the one that was due."""
         self.live.before_tick(self.k, b"junk")
         assert self.controller.tick(b"junk", self.k) is None
 
     # The operator
 
     def ask(self, topic: str, message: Message | bytes) -> Query:
-        """Put a question; it is answered between two ticks."""
         key = topics.key(topic, "aero")
         query = Query(key, message if isinstance(message, bytes) else message.encode())
         self.network.queryables[key](query)
@@ -182,7 +168,6 @@ class Loop:
         return answer
 
     def stream(self, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> None:
-        """A set-point comes [deg]."""
         self.raw(Setpoint(attitude=(roll, pitch, yaw)).encode())
 
     def raw(self, payload: bytes) -> None:
@@ -201,7 +186,6 @@ class Loop:
         return [event.text for event in self.published("event", Event) if event.kind == kind]
 
     def yaw(self) -> float:
-        """Of q_d at the last tick, level [deg]."""
         w, x, y, z = self.controller.desired
         assert (x, y) == (0.0, 0.0)
         return degrees(2 * atan2(z, w))

@@ -6,7 +6,6 @@ one without gain and state, and one with a known optimum, for searches of gains.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Final
 
@@ -48,8 +47,6 @@ class Expressions(ExpressionLaw[PDSettings]):
 
 
 class Python(PythonLaw[PDSettings]):
-    """The same, operation by operation."""
-
     Settings = PDSettings
     gains = ("kp", "kd", "ki")
 
@@ -63,8 +60,7 @@ class Python(PythonLaw[PDSettings]):
         error, rate = self.state["sign"] * e[first + 1 :], now.rate_error[first:]
         self.state["sum"] = self.state["sum"] + self.period * error
         kp, kd, ki = (now.gains[name] for name in self.gains)
-        u: Floats = -(kp * error) - kd[first:] * rate - ki * self.state["sum"]
-        return u
+        return np.asarray(-(kp * error) - kd[first:] * rate - ki * self.state["sum"])
 
 
 class Node:
@@ -86,27 +82,7 @@ def cycle() -> Node:
     return node
 
 
-class Cyclic(Python):
-    """Makes ten objects a tick that refer to one another, and keeps those of the last second for as long."""
-
-    kept: deque[Node]
-
-    def reset(self) -> None:
-        super().reset()
-        self.state["alive"] = np.zeros(1)
-        self.kept = deque(maxlen=round(1 / self.period))
-
-    def step(self, now: Now[Floats]) -> Floats:
-        self.kept.append(cycle())
-        for _ in range(4):
-            cycle()
-        self.state["alive"] = np.array([float(Node.alive)])
-        return super().step(now)
-
-
 class Bare(ExpressionLaw[LawSettings]):
-    """No gain that may change, and no state."""
-
     Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
@@ -114,23 +90,7 @@ class Bare(ExpressionLaw[LawSettings]):
         return -15 * now.attitude_error[first + 1 :] - 6 * now.rate_error[first:], {}
 
 
-class BarePython(PythonLaw[LawSettings]):
-    """Likewise."""
-
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        pass
-
-    def step(self, now: Now[Floats]) -> Floats:
-        first = 3 - self.actuators
-        u: Floats = -15 * now.attitude_error[first + 1 :] - 6 * now.rate_error[first:]
-        return u
-
-
 class OffsetSettings(LawSettings):
-    """One gain."""
-
     offset: Annotated[float, Field(gt=0, le=5)] = 0.5
 
 

@@ -80,20 +80,14 @@ class Turntable(Plant):
 
 
 class Pair(Turntable):
-    """Has two motors, as the paper's law commands."""
-
     actuators = 2
 
 
 class Octoturntable(Turntable):
-    """Has eight motors."""
-
     actuators = 8
 
 
 class Hardware(Pair):
-    """Does not repeat, and has no true state that it knows."""
-
     repeatable = False
 
     def truth(self) -> State | None:
@@ -101,8 +95,6 @@ class Hardware(Pair):
 
 
 class Legless(Turntable):
-    """Has no motors."""
-
     actuators = 0
 
 

@@ -45,12 +45,10 @@ def claim_of(
 
 
 def command(echo: int, code: int = 5) -> bytes:
-    """A command of WIRE that echoes a counter, with the voltages of `volts`."""
     return WIRE.command.pack(echo % COUNTERS, (code, -code))
 
 
 def volts(code: int = 5) -> tuple[float, float]:
-    """Voltages of a code of WIRE, which has 6 bits for ±24 V."""
     return code * 48 / 63, -code * 48 / 63
 
 
@@ -118,7 +116,6 @@ class Asker:
         return answers[0]
 
     def ask(self, topic: str, request: Message | None = None, by: str | None = None) -> Answer:
-        """The answer to an operator's command or a release."""
         return Answer.model_validate_json(self.query(topic, (request or Request()).encode(), by))
 
     def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:

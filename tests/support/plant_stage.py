@@ -38,7 +38,6 @@ class Wires(Link):
         self._due.append((tick, frame))
 
     def send(self, frame: bytes) -> None:
-        """Keep a measurement, and let the test answer it."""
         self.sent.append(frame)
         self.answer(frame)
 
@@ -47,13 +46,11 @@ class Wires(Link):
         return any(tick <= self.tick for tick, _ in self._due)
 
     def take(self) -> Arrival | None:
-        """The last frame that is due, in the order in which they were sent."""
         due = [frame for tick, frame in self._due if tick <= self.tick]
         self._due = [(tick, frame) for tick, frame in self._due if tick > self.tick]
         return Arrival(due[-1], time.monotonic_ns()) if due else None
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """As take: nothing comes by waiting."""
         del timeout_s
         return self.take()
 
@@ -62,8 +59,6 @@ class Wires(Link):
 
 
 class Grid:
-    """Ticks without time."""
-
     due_ns = 0
 
     def __init__(self, skip: Callable[[], int]) -> None:
@@ -126,7 +121,6 @@ class Stage(PlantNetwork):
         return [batch for batch in batches if batch is not None]
 
     def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
-        """Claim the plant for a controller `c`."""
         self._claims += 1
         return self.endpoint.claim(
             claim_of(
@@ -140,14 +134,12 @@ class Stage(PlantNetwork):
         )
 
     def command(self, measurement: bytes, codes: Sequence[float]) -> None:
-        """Answer a measurement at once."""
         counter = self.wire.measurement.counter(measurement)
         assert counter is not None
         self.wires.deliver(self.wire.command.pack(counter, codes), self.endpoint.ticked)
 
     @property
     def link(self) -> Link | None:
-        """The session's frames; None while there is no session."""
         return self.wires if self.endpoint.session is not None else None
 
     def serve(self) -> None:

@@ -12,8 +12,7 @@ AEROLOOP: Final = [sys.executable, "-P", "-m", "aeroloop"]
 PATIENT: Final = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 12}
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
-LONGEST_S: Final = 120.0
-"""For a command that takes up to 10 s here; CI may have other work."""
+LONGEST_S: Final = 120.0  # for a command that takes up to 10 s here; CI may have other work
 
 
 def aeroloop(*words: str, code: int | None = 0, cwd: Path | None = None) -> str:

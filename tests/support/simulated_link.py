@@ -18,8 +18,6 @@ def wire_of(measurement: Policy, command: Policy) -> WireSpec:
 
 
 class SimulatedLink(FakeClock, Link):
-    """Arrivals at their times."""
-
     def __init__(self, arrivals: list[Arrival], depth: int) -> None:
         super().__init__(now_ns=0)
         self._coming = deque(arrivals)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from websockets.sync.client import connect
@@ -18,8 +17,7 @@ from websockets.typing import Subprotocol
 from aeroloop.protocol.wire.attitude import Quaternion
 
 SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
-PATIENCE_S = 20.0
-"""For what comes within milliseconds on an idle machine."""
+PATIENCE_S = 20.0  # for what comes within milliseconds on an idle machine
 
 Fields = dict[int, list[Any]]
 
@@ -61,13 +59,11 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def quaternion(data: bytes) -> Quaternion:
-    """[w, x, y, z] of a foxglove.Quaternion."""
     x, y, z, w = (fields(data).get(number, [0.0])[0] for number in (1, 2, 3, 4))
     return w, x, y, z
 
 
 def orientation(pose_in_frame: bytes) -> Quaternion:
-    """Of a foxglove.PoseInFrame."""
     pose = fields(fields(pose_in_frame)[3][0])
     return quaternion(pose[2][0])
 
@@ -103,13 +99,10 @@ class Viewer:
         self.info = json.loads(self._socket.recv(PATIENCE_S))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._connecting.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._connecting.__exit__(None, None, None)
 
     def await_topics(self, *topics: str) -> None:
-        """Listen until all of these have been advertised."""
         while not set(topics) <= set(self.channels):
             self._read()
 
@@ -121,7 +114,6 @@ class Viewer:
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
     def first(self, topic: str) -> Shown:
-        """The next message of a topic."""
         while True:
             if (message := self._read()) is not None and message[0] == topic:
                 return message[1]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -14,8 +13,7 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 
-PATIENCE_S = 30.0
-"""How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""
+PATIENCE_S = 30.0  # how long to wait for what takes milliseconds: a shared machine can keep a process waiting
 
 
 def free_port() -> int:
@@ -26,7 +24,6 @@ def free_port() -> int:
 
 
 def accepts(port: int) -> bool:
-    """Whether somebody listens on a port of this machine."""
     with socket.socket() as probe:
         probe.settimeout(PATIENCE_S)
         return probe.connect_ex(("127.0.0.1", port)) == 0
@@ -57,9 +54,7 @@ class Gathering:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for member in self._members:
             if not member.is_closed():
                 member.close()

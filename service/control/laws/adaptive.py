@@ -15,10 +15,9 @@
     u        u              command before quantization                    V           3
 
 The equations without quantization, (C.16)–(C.23), are the same expressions with unquantized arguments; where the paper
-repeats an equation for its quantized form, the line carries both numbers. That (C.25) follows from them is proved in
-tests/service/control/laws/test_adaptive.py. Received values are within the bounds (C.28) and (C.29) of the true ones;
-errors are (C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the
-bound (C.30).
+repeats an equation for its quantized form, the line carries both numbers; (C.25) follows from them. Received values are
+within the bounds (C.28) and (C.29) of the true ones; errors are (C.31), (C.33) and (C.34). (C.36) is the quantizer at
+the controller's exit, with the error (C.35) in the bound (C.30).
 """
 
 from __future__ import annotations
@@ -58,13 +57,7 @@ _GIVEN: Final = ("q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C
 def equations(p: AdaptiveSettings, actuators: int, given: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
     """The law for these parameters, as CasADi expressions: eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot by name.
 
-    Args:
-        p: Parameters; the gains are not taken from them.
-        actuators: Number of voltages.
-        given: What to build them from, those of the module's table down to C1, C2 and Gamma.
-
-    Raises:
-        ValueError: B cannot be inverted, or does not fit so many actuators.
+    `given` is what to build them from: those of the module's table down to C1, C2 and Gamma. Raises as `voltages_for`.
     """
     q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains = (given[name] for name in _GIVEN)
     C1, C2, Gamma = (ca.diag(gain) for gain in gains)

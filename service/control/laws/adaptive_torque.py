@@ -9,25 +9,15 @@
     θ̂_d        torque_estimate    constant torque                                   N·m             3
     ε          friction_width     rate within which Coulomb friction changes sign   rad/s           1
 
-The body is (C.2) with three columns a body axis in place of one, and all of θ unknown:
-
-    Φ(ω) = [−diag ω, −diag tanh(ω/ε), I],    θ = (θ_v, θ_c, θ_d),    θ_v ≥ 0, θ_c ≥ 0
-
-The law is (C.22) with a gain k₁ of the attitude error, and with Φ at ω_r. Every law here feeds the damping as first
-estimated forward at ω = ω_r + z₂, hence the θ̂_v(t₀) beside C₂:
+The law is (C.22) with a gain k₁ of the attitude error and with Φ(ω) = [−diag ω, −diag tanh(ω/ε), I] at ω_r. Every law
+here feeds the damping as first estimated forward at ω = ω_r + z₂, hence the θ̂_v(t₀) beside C₂:
 
     B u = −k₁(±ε̃) − (C₂ − diag θ̂_v(t₀))z₂ − Φ(ω_r)θ̂ − Ψ − J(S(ω)Rω_d − Rω̇_d − α̇)
     θ̂' = Proj{Γ Φ(ω_r)ᵀ z₂}
 
-For equal k₁ and with θ̃ = θ − θ̂, the paper's Lyapunov function plus one term a column,
-
-    V = 2k₁(1 ∓ η̃) + ½ z₂ᵀJz₂ + ½ θ̃ᵀΓ⁻¹θ̃,
-    V̇ ≤ −k₁ ε̃ᵀC₁ε̃ − z₂ᵀ(C₂ + diag(θ_v − θ̂_v(t₀)))z₂ − z₂ᵀdiag(θ_c)(tanh(ω/ε) − tanh(ω_r/ε)) + θ̃ᵀΓ⁻¹θ̇
-
-whose third term is never positive, because tanh rises and ω − ω_r = z₂. service/theorem/README.md derives it.
-
-Proj keeps each element of θ̂ within a bound of its first value, and friction from being negative. While a motor
-saturates friction is not learned, and θ̂_d gives way to what the motors lack, as the PID's integral does.
+service/theorem/README.md derives that V = 2k₁(1 ∓ η̃) + ½ z₂ᵀJz₂ + ½ θ̃ᵀΓ⁻¹θ̃ falls. Proj keeps each element of θ̂ within a
+bound of its first value, and friction from being negative. While a motor saturates friction is not learned, and θ̂_d
+gives way to what the motors lack, as the PID's integral does.
 """
 
 from __future__ import annotations
@@ -94,10 +84,7 @@ class AdaptiveTorqueSettings(TrackingSettings):
 
 
 class AdaptiveTorque(ExpressionLaw[AdaptiveTorqueSettings]):
-    """The law of the module's text, with θ̂ integrated over a period by Euler's rule.
-
-    State: the three estimates; sign, of the equilibrium that is approached, 0 before the first tick.
-    """
+    """The law of the module's text, with θ̂ integrated over a period by Euler's rule."""
 
     Settings = AdaptiveTorqueSettings
     gains = ("k1", "C1", "C2", "Gamma_torque", "Gamma_damping", "Gamma_coulomb")

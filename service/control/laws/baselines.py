@@ -8,15 +8,8 @@
     τ        torque           B u                                           N·m         3
 
 With the feedforward of (C.22), the body (C.2) becomes J ω̇_e = τ, so each law is its feedback τ. The estimate of the
-damping is the paper's first one, and stays. All default gains come from one rule, `tuned`: each law gets the bandwidth
-and the damping ratio that the paper's gains give, and knows the same body.
-
-    pd       −k_p (±ε̃) − k_d ω_e                              Wen and Kreutz-Delgado 1991; Paden and Panja 1988
-    pid      the same − k_i e_I                               Goodarzi, Lee and Lee 2013; Åström and Hägglund 1995
-    sliding  −J (±λ/2)(η̃I + S(ε̃)) ω_e − K tanh(σ/Φ)           Crassidis, Vadali and Markley 2000; Slotine and Li 1991
-    lqr      −K [±2ε̃, ω_e]                                    Anderson and Moore 1990
-
-`nonadaptive` is no feedback of its own: it is the paper's law with θ̂ as first estimated.
+damping is the paper's first one, and stays. `nonadaptive` is the paper's law with that estimate. All default gains come
+from one rule, `tuned`: each law gets the bandwidth and damping ratio of the paper's gains, and knows the same body.
 
 q and −q are one attitude, so the feedback approaches e = [1, 0] or [−1, 0]. Which one is chosen at the first tick; it
 changes where the other has become nearer by more than the hysteresis, so that a body that was turned by hand does not
@@ -52,10 +45,7 @@ from aeroloop.service.control.laws.interface import (
     voltages_for,
 )
 
-# ── one tuning rule ──
-
-VOLTAGE_LIMIT: Final = 24.0
-"""Largest voltage of the Aero's supply [V]."""
+VOLTAGE_LIMIT: Final = 24.0  # largest voltage of the Aero's supply [V]
 TUNED: Final = ("pd", "pid", "adaptive-torque", "sliding", "lqr")
 """Kinds that the tuning rule has settings for. The law without adaptation has the paper's own gains."""
 
@@ -124,8 +114,6 @@ _PAPER: Final = response_of(_BODY.inertia, (0.3, 0.3, 0.3), (0.15, 0.15, 0.15)) 
 DEFAULTS: Final = {kind: tuned(kind, _BODY, _PAPER) for kind in TUNED}
 _PD, _PID, _SLIDING, _LQR = (DEFAULTS[kind] for kind in ("pd", "pid", "sliding", "lqr"))
 
-# ── what they have in common ──
-
 
 class TrackingSettings(EstimateSettings):
     """Model of the plant, a damping estimate that stays, and when the nearer of two equilibria is chosen anew."""
@@ -171,9 +159,6 @@ def feedforward(p: TrackingSettings, now: Now[ca.SX]) -> ca.SX:
     return cancelled - J * (S(omega) @ desired - R_ib @ now.desired_acceleration)
 
 
-# ── PD+ ──
-
-
 class PDSettings(TrackingSettings):
     """Model of the plant and gains. The default gains are those of the tuning rule."""
 
@@ -183,7 +168,7 @@ class PDSettings(TrackingSettings):
 
 
 class PD(TrackingLaw[PDSettings]):
-    """PD+: with V = 2 Σ k_p (1 − ±η̃) + ½ ω_eᵀJω_e for equal k_p, V̇ = −ω_eᵀk_d ω_e.
+    """PD+: τ = −k_p (±ε̃) − k_d ω_e. With V = 2 Σ k_p (1 − ±η̃) + ½ ω_eᵀJω_e for equal k_p, V̇ = −ω_eᵀk_d ω_e.
 
     J. T.-Y. Wen and K. Kreutz-Delgado, The Attitude Control Problem, IEEE Transactions on Automatic Control 36(10),
     1991; the feedforward of a PD+ law: B. Paden and R. Panja, Globally Asymptotically Stable 'PD+' Controller for Robot
@@ -195,9 +180,6 @@ class PD(TrackingLaw[PDSettings]):
 
     def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         return -now.gains["kp"] * sign * now.attitude_error[1:4] - now.gains["kd"] * now.rate_error, {}
-
-
-# ── PID with anti-windup ──
 
 
 class PIDSettings(TrackingSettings):
@@ -217,9 +199,7 @@ class PIDSettings(TrackingSettings):
 
 
 class PID(TrackingLaw[PIDSettings]):
-    """PID: the PD+ law with an integral e_I [rad], whose windup a back-calculation ends.
-
-        ė_I = ω_e ± c ε̃ + B(u − sat u)/(k_i T_t)
+    """PID: the PD+ law less k_i e_I. A back-calculation ends the windup: ė_I = ω_e ± c ε̃ + B(u − sat u)/(k_i T_t).
 
     Integral: F. Goodarzi, D. Lee and T. Lee, Geometric Nonlinear PID Control of a Quadrotor UAV on SE(3), European
     Control Conference, 2013, with ε̃ in place of their error in SO(3). Back-calculation: K. J. Åström and T. Hägglund,
@@ -250,9 +230,6 @@ class PID(TrackingLaw[PIDSettings]):
         return u, {**state, "integral": state["integral"] + share * excess / ki}
 
 
-# ── sliding mode ──
-
-
 class SlidingSettings(TrackingSettings):
     """Model of the plant, surface and layer. The defaults are those of the tuning rule."""
 
@@ -263,7 +240,7 @@ class SlidingSettings(TrackingSettings):
 
 
 class Sliding(TrackingLaw[SlidingSettings]):
-    """Smooth sliding mode: with σ = ω_e ± λ ε̃, J σ̇ = −K tanh(σ/Φ), so ½σᵀJσ falls.
+    """Smooth sliding mode: with σ = ω_e ± λ ε̃, τ = −J (±λ/2)(η̃I + S(ε̃)) ω_e − K tanh(σ/Φ), so ½σᵀJσ falls.
 
     On the surface σ = 0, ε̃ decays with the time constant 2/λ. Surface: J. L. Crassidis, S. R. Vadali and F. L. Markley,
     Optimal Variable-Structure Control Tracking of Spacecraft Maneuvers, Journal of Guidance, Control, and Dynamics
@@ -281,9 +258,6 @@ class Sliding(TrackingLaw[SlidingSettings]):
         return -along - now.gains["strength"] * ca.tanh(sigma / ca.SX(p.layer)), {}
 
 
-# ── LQR ──
-
-
 class LQRSettings(TrackingSettings):
     """Model of the plant and weights. The default weights are those of the tuning rule."""
 
@@ -297,7 +271,7 @@ class LQRSettings(TrackingSettings):
 
 
 class LQR(TrackingLaw[LQRSettings]):
-    """The discrete-time optimal regulator of the errors. Its gains follow from weights and period, so none may change.
+    """The discrete-time optimal regulator −K [±2ε̃, ω_e]. K follows from weights and period, so no gain may change.
 
     With the feedforward an axis is a double integrator, J φ̈ = τ with φ = ±2ε̃ to first order, held for a period. B. D.
     O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
@@ -317,10 +291,7 @@ def optimal_gain(J: float, attitude_weight: float, rate_weight: float, T: float)
 
     X = AᵀX(I + BBᵀX)⁻¹A + Q by doubling the horizon: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang,
     Structure-Preserving Algorithms for Periodic Discrete-Time Algebraic Riccati Equations, International Journal of
-    Control 77(8), 2004. SciPy, whose `solve_discrete_are` would do, is no dependency of the core.
-
-    Raises:
-        ValueError: The doubling does not end.
+    Control 77(8), 2004. SciPy, whose `solve_discrete_are` would do, is no dependency of the core. ValueError if none.
     """
     A, B = np.array([[1.0, T], [0.0, 1.0]]), np.array([[T * T / 2], [T]]) / J
     X = np.diag([attitude_weight, rate_weight])
@@ -329,12 +300,8 @@ def optimal_gain(J: float, attitude_weight: float, rate_weight: float, T: float)
         W = np.linalg.inv(np.eye(2) + G @ X)
         F, G, X, last = F @ W @ F, G + F @ W @ G @ F.T, X + F.T @ X @ W @ F, X
         if np.abs(X - last).max() <= 1e-14 * np.abs(X).max():
-            gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
-            return gain
+            return np.asarray((B.T @ X @ A / (1 + B.T @ X @ B))[0])
     raise ValueError("law: these weights and this period have no optimal gains")
-
-
-# ── the paper's law without adaptation ──
 
 
 class NonadaptiveSettings(EstimateSettings):
@@ -346,10 +313,7 @@ class NonadaptiveSettings(EstimateSettings):
 
 
 class Nonadaptive(ExpressionLaw[NonadaptiveSettings]):
-    """(C.37) with a constant θ̂, so Γ = 0 in (C.38): what it does worse than `adaptive` is what adaptation is for.
-
-    State: sign, 0 before the first tick, which chooses that of η̃ (Assumption 3).
-    """
+    """(C.37) with a constant θ̂, so Γ = 0 in (C.38): what it does worse than `adaptive` is what adaptation is for."""
 
     Settings = NonadaptiveSettings
     gains = ("C1", "C2")

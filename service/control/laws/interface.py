@@ -23,16 +23,13 @@ Vector = tuple[float, float, float]
 X = TypeVar("X")
 T = TypeVar("T", bound="LawSettings")
 
-MAX_GAIN: Final = 20.0
-"""The largest gain: no typing error makes one a hundred times too large."""
+MAX_GAIN: Final = 20.0  # no typing error makes one a hundred times too large
 Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
-Gains3 = tuple[Gain, Gain, Gain]
-"""One for each body axis: x, y, z."""
+Gains3 = tuple[Gain, Gain, Gain]  # one for each body axis: x, y, z
 PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
 MatrixGain = tuple[PositiveGain, PositiveGain, PositiveGain]
 """The same of a gain that must act: the diagonal of a positive definite matrix."""
-Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-"""The diagonal of a positive definite matrix."""
+Diagonal = tuple[PositiveFloat, PositiveFloat, PositiveFloat]  # the diagonal of a positive definite matrix
 _Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
 
 
@@ -44,7 +41,7 @@ class LawSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="strings")
 
-    kind: str = Field(description="which law: one of ours, an entry point of aeroloop.laws, or package.module:Class")
+    kind: str = Field(description="which law: one of ours, or package.module:Class")
     inertia: Diagonal = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
@@ -76,51 +73,36 @@ class EstimateSettings(LawSettings):
 class Now(NamedTuple, Generic[X]):
     """What a law computes a tick from, as CasADi columns or as arrays.
 
-    Attributes:
-        attitude: q, body relative to inertial, as received; scalar part first [1]. Shape (4,).
-        rate: ω as received, body frame [rad/s]. Shape (3,).
-        desired_attitude: q_d, relative to inertial [1]. Shape (4,).
-        desired_rate: ω_d, *inertial* frame: R(q)ᵀω_d is in the body frame [rad/s]. Shape (3,).
-        desired_acceleration: Its derivative, inertial frame [rad/s²]. Shape (3,).
-        attitude_error: e = q_d⁻¹ ∘ q, (C.16), the body relative to the desired frame: [1, 0, 0, 0] without error. A
-            torque along −e[1:4] turns back the shorter way if e[0] ≥ 0; −e is the same attitude [1]. Shape (4,).
-        rate_error: ω − R(q)ᵀω_d, (C.18), *body* frame [rad/s]. Shape (3,).
-        gains: The present value of each of `Law.gains`, by name; `Law.settings` has the configured one. Shape (1,) for
-            a number, else its length.
-        state: The named state after the last tick.
+    The error e = q_d⁻¹ ∘ q, (C.16), is the body relative to the desired frame: [1, 0, 0, 0] without error. A torque
+    along −e[1:4] turns back the shorter way if e[0] ≥ 0; −e is the same attitude.
     """
 
-    attitude: X
-    rate: X
-    desired_attitude: X
-    desired_rate: X
-    desired_acceleration: X
-    attitude_error: X
-    rate_error: X
-    gains: Mapping[str, X]
-    state: Mapping[str, X]
+    attitude: X  # q, body relative to inertial, as received; scalar part first [1]. Shape (4,)
+    rate: X  # ω as received, body frame [rad/s]. Shape (3,)
+    desired_attitude: X  # q_d, relative to inertial [1]. Shape (4,)
+    desired_rate: X  # ω_d, *inertial* frame: R(q)ᵀω_d is in the body frame [rad/s]. Shape (3,)
+    desired_acceleration: X  # its derivative, inertial frame [rad/s²]. Shape (3,)
+    attitude_error: X  # e [1]. Shape (4,)
+    rate_error: X  # ω − R(q)ᵀω_d, (C.18), *body* frame [rad/s]. Shape (3,)
+    gains: Mapping[str, X]  # the present value of each of `Law.gains`. Shape (1,) for a number, else its length
+    state: Mapping[str, X]  # after the last tick
 
 
 class Law(ABC, Generic[T]):
-    """A control law. Derive from `ExpressionLaw` or `PythonLaw`.
+    """A control law, for ticks of a period [s] and a number of voltages. Derive from `ExpressionLaw` or `PythonLaw`.
 
-    Args:
-        settings: An instance of the class's `Settings`, as configured. A gain's present value is in `Now.gains`.
-        period: Time between ticks [s].
-        actuators: Number of voltages to give. A constructor raises ValueError if it is no law for so many.
+    Its settings are an instance of the class's `Settings`, as configured; a gain's present value is in `Now.gains`. A
+    constructor raises ValueError if it is no law for so many actuators.
     """
 
-    Settings: ClassVar[type[LawSettings]]
-    """The model of its settings."""
+    Settings: ClassVar[type[LawSettings]]  # the model of its settings
     gains: ClassVar[tuple[str, ...]] = ()
     """Names of those settings that may change while it runs: numbers, or tuples of them."""
     units: ClassVar[Mapping[str, str]] = {}
     """Unit of each part of its named state, for tables and pages; 1 where none is given."""
 
     def __init__(self, settings: T, period: float, actuators: int) -> None:
-        self.settings = settings
-        self.period = period
-        self.actuators = actuators
+        self.settings, self.period, self.actuators = settings, period, actuators
 
 
 class ExpressionLaw(Law[T]):
@@ -150,9 +132,6 @@ class PythonLaw(Law[T]):
         """The voltages before quantization [V], shape (actuators,). Sets `state` to what it is after this tick."""
 
 
-# ── the body of a law's settings ──
-
-
 def gravity_torque(p: LawSettings, q: X) -> X:
     """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,).
 
@@ -169,7 +148,7 @@ def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
     A B of three columns serves two motors, too: they are its last two, and the first row is fictitious. Of an
     expression it is one, of numbers an array. Raises ValueError if B has no inverse, or another number of columns.
     """
-    B: Floats = check_allocation(p, actuators)
+    B = check_allocation(p, actuators)
     if not isinstance(torque, ca.SX):
         return (np.linalg.pinv(B) @ np.asarray(torque, dtype=np.float64))[-actuators:]
     if B.shape == (3, 3):

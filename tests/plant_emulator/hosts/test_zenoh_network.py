@@ -24,8 +24,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Grant, Status
 from aeroloop.protocol.messages.operator import Answer, Mark
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.runtime.node import Node, OccupiedError
-from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.runtime.node import Node
+from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
 from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
@@ -55,7 +55,7 @@ def test_a_second_plant_of_a_vehicle_refuses_to_start_and_names_the_first() -> N
         zenoh = gathering.join()
         key = topics.key("status", "aero", role="plant")
         eventually("a status", lambda: any(reply.ok is not None for reply in zenoh.get(key)))
-        with pytest.raises(OccupiedError, match=r"aero has a plant already \(.*, pid \d+\); stop that one, or"):
+        with pytest.raises(NetworkError, match=r"aero has a plant already \(.*, pid \d+\); stop that one, or"):
             Node("plant", "aero", gathering.settings, {})
         with running(gathering.settings, "another") as (_, emulator):
             assert emulator.endpoint.cause is None

@@ -23,9 +23,9 @@ from aeroloop.protocol.messages.operator import (
     Message,
     MessageError,
     Points,
+    Request,
     Setpoint,
     Sinusoid,
-    Stream,
     Track,
 )
 from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS
@@ -104,7 +104,6 @@ def test_every_message_that_a_role_may_send_is_read() -> None:
 
 
 def test_a_status_of_another_version_is_read_as_far_as_it_is_known() -> None:
-    """By an end that only needs to know which process it is, and in which state."""
     status = next(message for message in MESSAGES if isinstance(message, Status))
     newer = status.encode()[:-1] + b',"mood":{"good":true}}'
     assert Status.decode(newer, extra="ignore") == status
@@ -113,13 +112,14 @@ def test_a_status_of_another_version_is_read_as_far_as_it_is_known() -> None:
 
 
 def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
-    for payload in (b'{"\\u001b[2J\\n": 0}', b'{"text": "\\u001b[2J\\n"}', b'{"text": {"\\u001b[2J\\n": 0}}'):
+    for model, payload in (
+        (Request, b'{"\\u001b[2J\\n": 0}'),
+        (Mark, b'{"text": {"\\u001b[2J\\n": 0}}'),
+        (Track, b'{"reference": {"kind": "\\u001b[2J\\n"}}'),
+    ):
         with pytest.raises(MessageError) as refused:
-            Mark.decode(payload)
+            model.decode(payload)
         assert str(refused.value).isprintable()
-    with pytest.raises(MessageError, match=r"reference: tag ' \[2J ' found") as refused:
-        Track.decode(b'{"reference": {"kind": "\\u001b[2J\\n"}}')
-    assert str(refused.value).isprintable()
 
 
 # Bounds of fields
@@ -127,7 +127,6 @@ def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
 TWO = [(0.0, 0.0, 0.0)] * 2
 CLAIM = {"controller": "c", "session": "s", "period_ns": 1, "lockstep": False, "wire": {}}
 NUMBER = "Input should be a finite number"
-MILLISECOND = "Points: times must rise by at least a millisecond"
 
 
 @pytest.mark.parametrize(
@@ -137,24 +136,18 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
         (Claim, {**CLAIM, "session": "s*"}, "session: String should match pattern"),
         (Claim, {**CLAIM, "session": "status"}, "session: 'status' is the key of a topic and cannot name a session"),
         (Gains, {"C1": (nan, 0.3, 0.3)}, f"C1: {NUMBER}"),
-        (Gains, {"K": nan}, f"K: {NUMBER}"),
         (Gains, {"C1": (0.3,) * (MAX_GAINS + 1)}, f"C1: Tuple should have at most {MAX_GAINS} items"),
         (Gains, {f"K{i}": 0.3 for i in range(MAX_GAINS + 1)}, f"Gains: a law has {MAX_GAINS} gains at the most"),
         (Points, {"times": [0, 1, 2], "attitudes": TWO}, "Points: 3 times for 2 attitudes"),
         (Points, {"times": [1, 2], "attitudes": TWO}, "Points: the first time must be 0"),
         (Points, {"times": [0, nan], "attitudes": TWO}, f"times: {NUMBER}"),
-        (Points, {"times": [0, 0.0009], "attitudes": TWO}, MILLISECOND),
+        (Points, {"times": [0, 0.0009], "attitudes": TWO}, "Points: times must rise by at least a millisecond"),
         (Points, {"times": [0, 1], "attitudes": [TWO[0], (0, nan, 0)]}, f"attitudes: {NUMBER}"),
-        (
-            Points,
-            {"times": range(MAX_POINTS + 1), "attitudes": TWO},
-            f"times: List should have at most {MAX_POINTS} items after validation, not more",
-        ),
+        (Points, {"times": range(MAX_POINTS + 1), "attitudes": TWO}, f"times: List should have at most {MAX_POINTS}"),
         (Hold, {"attitude": (0.0, inf, 0.0)}, f"attitude: {NUMBER}"),
         (Setpoint, {"attitude": (0.0, nan, 0.0)}, f"attitude: {NUMBER}"),
         (Sinusoid, {"amplitude": (0.0, nan, 0.0)}, f"amplitude: {NUMBER}"),
         (Sinusoid, {"frequency": (0.0, inf, 0.0)}, "frequency: Input should be less than or equal to 100"),
-        (Stream, {"timeout_s": 0.0}, "timeout_s: Input should be greater than 0"),
         (Track, {"reference": Hold(), "within_s": 0.0}, "within_s: Input should be greater than or equal to 0.02"),
         (Mark, {"text": "a" * 201}, "text: String should have at most 200 characters"),
         (Mark, {"text": "\x1b[2J"}, "text: every character must be printable"),

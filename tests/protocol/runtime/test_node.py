@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import zenoh
 
@@ -18,17 +17,14 @@ from tests.support.zenoh_network import Gathering, eventually
 def test_only_a_query_that_names_its_verb_acts() -> None:
     """Tools that list a network query `**`: a plant must be neither stopped nor armed by that."""
     done: list[str] = []
+
+    def act(verb: str) -> Answer:
+        done.append(verb)
+        return Answer(done=True, text=verb)
+
     with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
-
-        def serve(verb: str) -> None:
-            def act() -> Answer:
-                done.append(verb)
-                return Answer(done=True, text=verb)
-
-            role.serve(verb, Request, lambda _: act)
-
-        serve("arm")
-        serve("stop")
+        role.serve("arm", Request, lambda _: lambda: act("arm"))
+        role.serve("stop", Request, lambda _: lambda: act("stop"))
         session = gathering.join()
         eventually("a link", lambda: any(session.get("aeroloop/aero/description/plant", timeout=1.0)))
 
@@ -50,11 +46,12 @@ def test_only_a_query_that_names_its_verb_acts() -> None:
 LONG = Track(reference=Points(times=[float(n) for n in range(MAX_VALUES)], attitudes=[(0.0, 0.0, 0.0)] * MAX_VALUES))
 
 
-def asked(role: Node, loop: Loop, topic: str, payload: bytes) -> Query:
-    query = Query(topics.key(topic, "aero"), payload)
+def asked(loop: Loop, topic: str, payload: bytes, key: str = "") -> list[Answer]:
+    """Answers to a query, for which the loop has looked at its inbox."""
+    query = Query(key or topics.key(topic, "aero"), payload)
     loop.network.queryables[topics.key(topic, "aero")](query)
-    role.take_inbox()
-    return query
+    loop.role.take_inbox()
+    return query.answers
 
 
 def done() -> Message:
@@ -64,27 +61,20 @@ def done() -> Message:
 def test_of_requests_that_take_long_to_parse_one_is_parsed_in_ten_seconds() -> None:
     """And short ones meanwhile as ever; garbage counts, as it takes as long."""
     loop, taken = Loop(AT_REST), list[Track]()
-
-    def prepare(track: Track) -> Callable[[], Message]:
-        taken.append(track)
-        return done
-
-    loop.role.serve("track", Track, prepare)
-
-    def ask(payload: bytes) -> str:
-        (answer,) = asked(loop.role, loop, "track", payload).answers
-        return answer.text
-
-    loop.clock.advance(LONG_S)
-    assert ask(LONG.encode()) == "done"
-    assert "one in 10 s is taken" in ask(LONG.encode())
-    assert ask(Track(reference=AT_REST).encode()) == "done"
-    loop.clock.advance(LONG_S)
-    assert "not a Track" in ask(b"[" + b"0," * 2000 + b"0]")
-    assert "one in 10 s is taken" in ask(LONG.encode())
-    loop.clock.advance(LONG_S)
-    assert ask(LONG.encode()) == "done"
-    assert taken == [LONG, Track(reference=AT_REST), LONG]
+    loop.role.serve("track", Track, lambda track: taken.append(track) or done)  # type: ignore[func-returns-value]
+    short, garbage = Track(reference=AT_REST), b"[" + b"0," * 2000 + b"0]"
+    for pause_s, payload, text in (
+        (LONG_S, LONG.encode(), "done"),
+        (0, LONG.encode(), "one in 10 s is taken"),
+        (0, short.encode(), "done"),
+        (LONG_S, garbage, "not a Track"),
+        (0, LONG.encode(), "one in 10 s is taken"),
+        (LONG_S, LONG.encode(), "done"),
+    ):
+        loop.clock.advance(pause_s)
+        (answer,) = asked(loop, "track", payload)
+        assert text in answer.text
+    assert taken == [LONG, short, LONG]
 
 
 def test_a_request_longer_than_its_topics_is_dropped_whatever_its_key_is() -> None:
@@ -92,10 +82,8 @@ def test_a_request_longer_than_its_topics_is_dropped_whatever_its_key_is() -> No
     loop, prepared = Loop(AT_REST), list[Message]()
     loop.role.serve("stop", Request, lambda request: prepared.append(request) or done)  # type: ignore[func-returns-value]
     for size, answers in ((topics.TOPICS["stop"].request, 1), (topics.TOPICS["stop"].request + 1, 0)):
-        query = Query("aeroloop/**/stop", b"{}".ljust(size))
-        loop.network.queryables[topics.key("stop", "aero")](query)
-        loop.role.take_inbox()
-        assert (len(query.answers), len(prepared)) == (answers, 1)
+        assert len(asked(loop, "stop", b"{}".ljust(size), "aeroloop/**/stop")) == answers
+        assert len(prepared) == 1
 
 
 def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_ticks() -> None:
@@ -121,24 +109,17 @@ def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_t
 def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:
     """Zenoh merges tokens of one name, so a second one neither appears nor disappears."""
     with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
-        seen = list[bool]()
+        seen, marks = list[bool](), list[bool]()
         role.watch_token("controller", seen.append)
-        marks = list[bool]()
         role.watch_token("mark", marks.append)
         controller, stranger = gathering.join(), gathering.join()
         genuine = controller.liveliness().declare_token("aeroloop/aero/alive/controller")
         eventually("it appears", lambda: seen == [True])
 
-        def forge(name: str) -> None:
-            token = stranger.liveliness().declare_token(f"aeroloop/aero/alive/{name}")
-            token.undeclare()
-            mark = stranger.liveliness().declare_token("aeroloop/aero/alive/mark")  # after it, by the same link
-            eventually("the mark", lambda: bool(marks) and marks[-1])
-            mark.undeclare()
-            eventually("no mark", lambda: not marks[-1])
-
-        for name in ("controller", "controller-2", "plant", "**"):
-            forge(name)
+        for n, name in enumerate(("controller", "controller-2", "plant", "**"), start=1):
+            stranger.liveliness().declare_token(f"aeroloop/aero/alive/{name}").undeclare()
+            stranger.liveliness().declare_token("aeroloop/aero/alive/mark").undeclare()  # after it, by the same link
+            eventually("the mark and its end", lambda n=n: len(marks) == 2 * n)  # type: ignore[misc]  # bound now
         assert seen == [True]
         genuine.undeclare()
         eventually("it disappears", lambda: seen == [True, False])

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network import FrameSession
-from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
+from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings, SecuritySettings
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import Gathering, eventually
@@ -31,14 +30,13 @@ def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
 def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[FrameSession, FrameSession]]:
     """A plant's, which listens, and a controller's, which is connected to it."""
     request.getfixturevalue("beyond")
-    secured = request.param == "certificates"
-    settings = NetworkSettings(rendezvous=[free_rendezvous("tls" if secured else "tcp")], insecure=True)
-    if secured:
+    settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
+    if request.param == "certificates":
         authority = Authority(tmp_path / "keys")
         for role in ("plant", "controller"):
             authority.issue(role, "aero")
-        security = settings.security.model_copy(update={"directory": str(authority.folder)})
-        settings = settings.model_copy(update={"security": security})
+        security = SecuritySettings(directory=str(authority.folder))
+        settings = NetworkSettings(rendezvous=[free_rendezvous("tls")], security=security)
     plant, controller = FrameSession(settings, PLANT), FrameSession(settings, CONTROLLER)
     plant.listen()
     eventually("a link", lambda: bool(controller.connect(plant.endpoint)))
@@ -67,22 +65,12 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[FrameSessi
         plant.close()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        NetworkSettings(),
-        NetworkSettings(transport="tcp", rendezvous=[FAR], insecure=True),
-        NetworkSettings(rendezvous=[]),
-    ],
-)
-def test_on_loopback_or_where_not_wanted_there_are_none(settings: NetworkSettings) -> None:
-    plant = FrameSession(settings, PLANT)
-    plant.listen()
-    assert not plant.wanted
-    assert (plant.session, plant.endpoint) == (None, "")
-
-
-def test_an_endpoint_that_is_not_of_the_network_is_not_connected_to() -> None:
+def test_on_loopback_where_not_wanted_and_at_an_endpoint_that_is_not_of_the_network_there_are_none() -> None:
+    for settings in (NetworkSettings(), NetworkSettings(transport="tcp", rendezvous=[FAR], insecure=True)):
+        plant = FrameSession(settings, PLANT)
+        plant.listen()
+        assert not plant.wanted
+        assert (plant.session, plant.endpoint) == (None, "")
     controller = FrameSession(NetworkSettings(rendezvous=[FAR], insecure=True), CONTROLLER)
     assert controller.wanted
     assert controller.connect("udp/192.0.2.2:7447?rel=1;mixed_rel=1") is False

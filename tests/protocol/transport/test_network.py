@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
 from aeroloop.protocol.runtime.host import listener, name_process
 from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.transport.network_settings import PORTS, NetworkError, NetworkSettings
-from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
+from tests.support.zenoh_network import Gathering, accepts, eventually
 
 
 class Listener:
@@ -103,34 +103,17 @@ def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() 
         assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), None)
 
 
-def one_line(error: BaseException) -> str:
-    text = str(error)
-    assert text
-    assert "\n" not in text
-    return text
-
-
 def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
     with Gathering() as gathering, socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(NetworkError) as caught:
             gathering.join(NetworkSettings(rendezvous=gathering.settings.rendezvous, listen=[endpoint]))
-        text = one_line(caught.value)
+        (text,) = str(caught.value).splitlines()
         assert f"cannot listen on {endpoint}" in text
         assert "--set network.listen='[\"tcp/127.0.0.1:0\"]'" in text
         assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
-
-
-def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
-    with Gathering() as gathering:
-        place = f"tcp/127.0.0.1:{free_port()}"
-        alone = gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
-        assert not any(accepts(port) for port in gathering.ports)
-        assert list(alone.info.peers_zid()) == []
-        caller = gathering.join(NetworkSettings(rendezvous=[], connect=[place]))
-        receives(Listener(alone, "t/word"), caller, b"found")
 
 
 @pytest.mark.parametrize("topic", [topic for topic in TOPICS.values() if topic.kind != "token"], ids=lambda t: t.name)

@@ -14,15 +14,15 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.node import Node
+from aeroloop.protocol.transport.certificate import OF_ONE_VEHICLE
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.network import command_session, join, route
-from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings
+from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, SecuritySettings
 from aeroloop.service.host.operator import gather, stop
-from tests.protocol.transport.test_network import Listener, one_line, receives
+from tests.protocol.transport.test_network import Listener, receives
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
 
-SPEAKING = "controller", "aero"
 ROUTER, SPEAKER = Identity(("router",)), Identity(("controller",), "aero")
 WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role="controller-1-abcd")
 """What a controller may publish and hold, and an operator receive."""
@@ -30,15 +30,10 @@ WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role=
 
 def of(authority: Authority) -> NetworkSettings:
     """A network of clients with certificates of an authority, which are issued here."""
-    for role, vehicle in (("router", None), ("operator", None), ("recorder", None), ("plant", "aero"), SPEAKING):
-        authority.issue(role, vehicle)
-    return NetworkSettings.model_validate(
-        {
-            "mode": "client",
-            "rendezvous": f"tls/127.0.0.1:{free_port()}",
-            "security": {"directory": str(authority.folder), "vehicles": ["aero"]},
-        }
-    )
+    for role in ("router", "operator", "recorder", "plant", "controller"):
+        authority.issue(role, "aero" if role in OF_ONE_VEHICLE else None)
+    security = SecuritySettings(directory=str(authority.folder), vehicles=["aero"])
+    return NetworkSettings(mode="client", rendezvous=[f"tls/127.0.0.1:{free_port()}"], security=security)
 
 
 @pytest.fixture(params=["tcp", "tls"])
@@ -76,7 +71,7 @@ def test_a_client_that_starts_first_waits_for_the_router_and_a_command_names_it(
     thread.start()
     with pytest.raises(NetworkError) as caught, command_session(settings):
         pass
-    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
+    assert str(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
     assert not joined
     open_sessions.enter_context(closing(route(settings, ROUTER)))
     thread.join()

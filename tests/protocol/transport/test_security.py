@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from aeroloop.protocol.transport.certificate import PLAIN_S, CertificateError, read_certificate, refusal
-from aeroloop.protocol.transport.network import command_session, join
+from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
+from aeroloop.protocol.transport.network import PLAIN_S, command_session, join, refusal
 from aeroloop.protocol.transport.network_settings import (
     READER,
     Identity,
@@ -86,20 +86,19 @@ class Secured:
         )
         self.place = protected(self.settings, PLANT).settings.rendezvous_endpoints[0]
 
+    def certificate(self, kind: str) -> Path:
+        """A recorder's, which is good, expired or of a foreign authority."""
+        if kind == "foreign":
+            return self.foreign.issue("recorder")
+        return self.authority.issue("recorder", ends=-DAY if kind == "expired" else DAY)
+
+
+SPOILED = ("expired", "foreign")
+
 
 @pytest.fixture
 def network(tmp_path: Path) -> Secured:
     return Secured(tmp_path)
-
-
-def spoiled(network: Secured, kind: str) -> Path:
-    """A certificate that its holder should not have used."""
-    if kind == "expired":
-        return network.authority.issue("recorder", ends=-DAY)
-    return network.foreign.issue("recorder")
-
-
-SPOILED = ("expired", "foreign")
 
 
 @contextmanager
@@ -126,7 +125,7 @@ def test_peers_link_by_their_certificates_and_a_command_visits_them(network: Sec
 
 @pytest.mark.parametrize("kind", [*SPOILED, "none"])
 def test_a_peer_without_a_good_certificate_does_not_link(network: Secured, kind: str) -> None:
-    certificate = None if kind == "none" else spoiled(network, kind)
+    certificate = None if kind == "none" else network.certificate(kind)
     place = network.place.replace("tls", "tcp") if certificate is None else network.place
     connect = {"endpoints": [place], "exit_on_failure": True, "timeout_ms": 0}
     with (
@@ -139,7 +138,7 @@ def test_a_peer_without_a_good_certificate_does_not_link(network: Secured, kind:
 
 @pytest.mark.parametrize("kind", ["good", *SPOILED])
 def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(network: Secured, kind: str) -> None:
-    certificate = network.authority.issue("recorder") if kind == "good" else spoiled(network, kind)
+    certificate = network.certificate(kind)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, certificate.with_suffix(".key"))
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -164,13 +163,16 @@ def test_a_link_closes_when_its_certificate_expires(network: Secured) -> None:
         eventually("its end", lambda: not links(plant))
 
 
-THEIRS = {"expired": "certificate has expired", "foreign": "not of this authority"}
-OURS = {"expired": "expired or not yet valid", "foreign": "not of this authority"}
+THEIRS = {"expired": "certificate has expired", "foreign": "issuer certificate"}
+OURS = {"expired": "certificate expired", "foreign": "issuer certificate"}
 
 
 @pytest.mark.parametrize("kind", SPOILED)
 def test_a_refused_peer_and_the_one_that_refuses_it_learn_why(network: Secured, kind: str) -> None:
-    wrong, mine = read_certificate(spoiled(network, kind)), read_certificate(network.authority.folder / "operator.pem")
+    wrong, mine = (
+        read_certificate(network.certificate(kind)),
+        read_certificate(network.authority.folder / "operator.pem"),
+    )
     with join(network.settings, PLANT):
         assert refusal(network.place, mine) is None
         line = refusal(network.place, wrong) or ""
@@ -183,13 +185,10 @@ def test_a_refused_peer_and_the_one_that_refuses_it_learn_why(network: Secured, 
         assert THEIRS[kind] in line
 
 
-def test_a_peer_without_tls_is_told_from_one_that_is_halted(network: Secured) -> None:
-    mine = read_certificate(network.authority.folder / "operator.pem")
-    plain = NetworkSettings(rendezvous=[free_rendezvous()])
-    with join(plain):
-        assert "does not speak TLS" in (
-            refusal(plain.rendezvous_endpoints[0].replace("tcp", "tls"), mine, PLAIN_S) or ""
-        )
+def test_a_peer_without_tls_differs_from_one_that_is_halted(network: Secured) -> None:
+    mine, plain = read_certificate(network.authority.folder / "operator.pem"), free_rendezvous()
+    with join(NetworkSettings(rendezvous=[plain])):
+        assert "does not speak TLS" in (refusal(plain.replace("tcp", "tls"), mine, PLAIN_S) or "")
     with socket.create_server(("127.0.0.1", 0)) as halted:
         assert refusal(f"tls/127.0.0.1:{halted.getsockname()[1]}", mine) is None
     assert refusal(f"tls/127.0.0.1:{free_port()}", mine) is None
@@ -199,9 +198,7 @@ def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(
     nobody = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.authority.folder))})
     with pytest.raises(NetworkError, match="name them in"):
         protected(nobody, READER)
-    keys = f"network.security.directory={network.authority.folder}"
-    of_one = load_target(None, ["vehicle=falcon", keys])
-    assert of_one.network.security.vehicles == ["falcon"]
-    both = load_target(None, ["vehicle=falcon", keys, 'network.security.vehicles=["aero"]'])
+    named = ["vehicle=falcon", f"network.security.directory={network.authority.folder}"]
+    assert load_target(None, named).network.security.vehicles == ["falcon"]
+    both = load_target(None, [*named, 'network.security.vehicles=["aero"]'])
     assert both.network.security.vehicles == ["falcon", "aero"]
-    assert load_target().network.security.vehicles == []

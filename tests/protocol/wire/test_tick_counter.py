@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,31 +10,21 @@ from aeroloop.protocol.wire.frames import TickCounter
 PERIOD_NS = 2_000_000
 
 
-class Run(NamedTuple):
-    """Measurements as they arrive: (tick, time of arrival), in order of arrival, on a clock with any offset and drift.
-
-    The receiver's clock sees periods that are longer or shorter by up to 1 %. Frames are dropped, ticks are skipped,
-    frames overtake each other, and each is held up for less than 3/4 of the counter's range. Towards that counts what
-    the clocks drift, 1 %, over a gap before the frame and over the ticks that overtook it. The first frame, and one in
-    every `counters` ticks, is late by an eighth of the range at the most, so that the mark, which moves by 3 % of a
-    period a tick against the true grid, is never a quarter of the range late.
-    """
-
-    counters: int
-    arrivals: list[tuple[int, int]]
-
-
 @st.composite
-def runs(draw: st.DrawFn) -> Run:
+def runs(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]]]:
+    """A counter's range, and measurements (tick, time of arrival) in order of arrival, on a clock with any offset.
+
+    The clock drifts by up to 1 %. Frames are dropped, ticks are skipped, frames overtake each other, each late by
+    less than 3/4 of the counter's range, less what the clocks drift over a gap before it. One frame in every `counters`
+    ticks is late by an eighth of the range at the most, so that the mark, which moves by 3 % of a period a tick against
+    the true grid, is never a quarter of the range late.
+    """
     counters = 2 ** draw(st.sampled_from([4, 5, 8, 10]))
     offset_ns = draw(st.integers(-(10**18), 10**18))
     period_ns = PERIOD_NS * (1 + draw(st.sampled_from([-0.01, -0.003, 0.0, 0.005, 0.01])))
     punctual = counters // 8
-    steps = draw(
-        st.lists(
-            st.tuples(st.one_of(st.just(1), st.integers(1, 3), st.integers(1, counters)), st.floats(0, 1)), max_size=300
-        )
-    )
+    skips = st.one_of(st.just(1), st.integers(1, 3), st.integers(1, counters))
+    steps = draw(st.lists(st.tuples(skips, st.floats(0, 1)), max_size=300))
     tick, last_punctual = 0, 0
     arrivals = [(0, offset_ns + round(draw(st.floats(0, 1)) * punctual * PERIOD_NS))]
     for skip, late in steps:
@@ -45,15 +33,18 @@ def runs(draw: st.DrawFn) -> Run:
         if tick - last_punctual >= counters:
             most, last_punctual = punctual, tick
         arrivals.append((tick, offset_ns + round(tick * period_ns + late * most * PERIOD_NS)))
-    return Run(counters, sorted(arrivals, key=lambda arrival: arrival[1]))
+    return counters, sorted(arrivals, key=lambda arrival: arrival[1])
 
 
 @settings(max_examples=150)
 @given(runs())
-def test_a_frame_has_its_true_tick_however_it_was_held_up_and_whatever_the_clocks_say(run: Run) -> None:
-    ticks, last = TickCounter(PERIOD_NS, run.counters, lockstep=False), -1
-    for tick, at_ns in run.arrivals:
-        assert ticks.advance(tick % run.counters, at_ns) == (tick if tick > last else None)
+def test_a_frame_has_its_true_tick_however_it_was_held_up_and_whatever_the_clocks_say(
+    run: tuple[int, list[tuple[int, int]]],
+) -> None:
+    counters, arrivals = run
+    ticks, last = TickCounter(PERIOD_NS, counters, lockstep=False), -1
+    for tick, at_ns in arrivals:
+        assert ticks.advance(tick % counters, at_ns) == (tick if tick > last else None)
         last = max(last, tick)
         assert ticks.tick == last
 

@@ -12,7 +12,7 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.model.emulated import SUBSTEPS
-from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
@@ -20,6 +20,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from tests.support import ideal
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
+from tests.support.plant_end import claim_of
 from tests.support.twin_body import body_of
 
 PERIOD = 0.002
@@ -31,8 +32,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
     period_ns, reference = round(PERIOD * 1e9), Sinusoid()
     plant = ideal.PLANT.build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, period_ns, lockstep=True)
-    claim = Claim(controller="test", session="loop", period_ns=period_ns, lockstep=True, auto_arm=True, wire=CONTINUOUS)
-    assert isinstance(endpoint.claim(claim), Grant)
+    assert isinstance(endpoint.claim(claim_of(wire=CONTINUOUS, period_ns=period_ns, lockstep=True)), Grant)
     controller = Controller(CONTINUOUS, LAW, reference, PERIOD)
     law, theta = body_of(LAW), np.array(LAW.damping_estimate)
     desired = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency)).desired

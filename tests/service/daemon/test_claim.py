@@ -18,11 +18,17 @@ from aeroloop.service.daemon.claim import ClaimClient
 
 
 def record(yaw: float) -> SessionRecord:
-    """Of a session s."""
     return SessionRecord(
         controller="c", session="s", gains=Gains(), gains_from="configured", reference=Hold(attitude=(0.0, 0.0, yaw)),
         reference_from="operator", within_s=0.0, since_tick=0,
     )  # fmt: skip
+
+
+def claims_of(zenoh: Any, **role: Any) -> ClaimClient:
+    """The claims of a controller on a network."""
+    known = {"vehicle": "aero", "name": "c", "datagrams": SimpleNamespace(wanted=False)}
+    node = cast(Node, SimpleNamespace(zenoh=zenoh, **known | role))
+    return ClaimClient(node, LoopSettings(), WireSpec(), auto_arm=False)
 
 
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:
@@ -36,8 +42,7 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
     def reply(answer: Answer) -> None:
         handlers[-1](SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer.encode()))))
 
-    role = cast(Node, SimpleNamespace(zenoh=SimpleNamespace(get=get), vehicle="aero"))
-    claims = ClaimClient(role, LoopSettings(), WireSpec(), auto_arm=False)
+    claims = claims_of(SimpleNamespace(get=get))
     first, second = record(1.0), record(2.0)
     claims.keep(first)
     assert sent == []  # no session runs
@@ -58,15 +63,12 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
 
 
 class Plant:
-    """A Zenoh session on which a plant answers, or none."""
-
     def __init__(self, status: bytes | None, claim: Message | None = None) -> None:
         answer = (claim or Grant(session="s")).encode()
-        self._answers = {} if status is None else {"status": status, "claim": answer}
+        self.answers = {} if status is None else {"status": status, "claim": answer}
 
     def get(self, key: str, **_: object) -> list[SimpleNamespace]:
-        """What the plant answers."""
-        answers = [answer for topic, answer in self._answers.items() if f"/{topic}" in key]
+        answers = [answer for topic, answer in self.answers.items() if f"/{topic}" in key]
         return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers]
 
 
@@ -74,16 +76,12 @@ def test_a_refusal_is_an_event_once_and_stays_known_until_a_grant(monkeypatch: p
     """So that an operator's request can be answered with it: "stopped; `op arm` clears it"."""
     link, events = SimpleNamespace(close=lambda: None), list[str]()
     monkeypatch.setattr(claim, "ZenohLink", lambda *_, **__: link)
-    zenoh = Plant(b"", Refusal(reason="stopped"))
-    role = SimpleNamespace(
-        zenoh=zenoh, vehicle="aero", name="c", datagrams=SimpleNamespace(wanted=False),
-        event=lambda _kind, text, _session: events.append(text),
-    )  # fmt: skip
-    claims = ClaimClient(cast(Node, role), LoopSettings(), WireSpec(), auto_arm=False)
+    plant = Plant(b"", Refusal(reason="stopped"))
+    claims = claims_of(plant, event=lambda _kind, text, _session: events.append(text))
     for _ in range(3):
         assert claims.claim() is None
         assert (claims.refusal, events) == ("stopped", ["aero refuses: stopped"])
-    role.zenoh = Plant(b"")
+    plant.answers["claim"] = Grant(session="s").encode()
     assert claims.claim() is not None
     assert claims.refusal == ""
 
@@ -111,9 +109,6 @@ def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
     ).encode()  # fmt: skip
     first, datagrams, warned = Plant(status), SimpleNamespace(name="datagrams"), []
     asked = SimpleNamespace(wanted=True, linked=False, connect=lambda _: passes, session=datagrams)
-    role = SimpleNamespace(
-        zenoh=first, vehicle="aero", name="c", datagrams=asked, warn=lambda *words: warned.append(words[-1])
-    )
     used: list[object] = []
 
     def link(session: object, **_: object) -> object:
@@ -121,7 +116,7 @@ def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
         return object()
 
     monkeypatch.setattr(claim, "ZenohLink", link)
-    claims = ClaimClient(cast(Node, role), LoopSettings(), WireSpec(), auto_arm=False)
+    claims = claims_of(first, datagrams=asked, warn=lambda *words: warned.append(words[-1]))
     assert (claims.claim() is not None) == (carrier != "none")
     assert used == {"datagrams": [datagrams], "first": [first], "none": []}[carrier]
     assert claims.by_datagrams == (carrier == "datagrams")

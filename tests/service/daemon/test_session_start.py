@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import accumulate
-from math import degrees
 
 import pytest
 from hypothesis import given, settings
@@ -14,19 +13,17 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Points, Reference, 
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, Loop, turned
+from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, Loop, gains_with, turned
 
 GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 TARGET = Hold(attitude=(0.0, 0.0, 60.0))
 
 
 def of(after_restart: str, reference: Reference = SWING) -> Loop:
-    """A controller that starts; its configured reference moves."""
     return Loop(reference, ControllerSettings.model_validate({"after_restart": after_restart}))
 
 
 def record(reference: Reference, *, ended: TripCause = TripCause.HOLDER_GONE) -> SessionRecord:
-    """What the plant has of the session before."""
     return SessionRecord(
         controller="controller-6", session="s", gains=GAINS, gains_from="operator", reference=reference,
         reference_from="operator", within_s=2.0, since_tick=0, ended=ended, ended_tick=5000,
@@ -34,7 +31,6 @@ def record(reference: Reference, *, ended: TripCause = TripCause.HOLDER_GONE) ->
 
 
 def asked(loop: Loop, reference: Reference = TARGET) -> None:
-    """An operator sets gains and a reference, and it is reached."""
     loop.ask("set_gains", GAINS)
     loop.ask("track", Track(reference=reference, within_s=3.0))
     loop.run(4.0)
@@ -54,14 +50,11 @@ def reached(loop: Loop, yaw: float) -> float:
     return loop.yaw()
 
 
-# ── hold ──
-
-
 @settings(max_examples=10)
 @given(yaw=st.floats(-179, 179))
 def test_held_is_the_attitude_found_and_it_stays_there_until_an_operator_moves_it(yaw: float) -> None:
-    """From the first valid measurement on."""
-    loop = of("hold")
+    """From the first valid measurement on; the configured reference is followed when an operator asks for it."""
+    loop = of("hold", Hold(attitude=(0.0, 0.0, 15.0)))
     loop.begin()
     loop.tick([WIRE.attitude.quantizer().invalid] * 6)
     for _ in range(50):
@@ -70,87 +63,45 @@ def test_held_is_the_attitude_found_and_it_stays_there_until_an_operator_moves_i
         assert max(map(abs, loop.controller.rate_error)) == 0.0
     assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("held", "configured")
     assert [(change.tick, change.start is not None) for change in loop.changes()] == [(0, False), (1, True)]
-    loop.assert_it_runs_again()
-
-
-def test_the_configured_reference_is_followed_when_an_operator_asks_for_it() -> None:
-    loop = of("hold", Hold(attitude=(0.0, 0.0, 15.0)))
-    start(loop, 0.0)
-    query = loop.ask("track", Track(reference=None))
-    assert reached(loop, 0.0) == pytest.approx(15.0)
-    assert query.answers[0].done
+    assert loop.answered("track", Track(reference=None)).done
+    assert reached(loop, yaw) == pytest.approx(15.0)
     assert loop.live.record.reference_from == "configured"
-
-
-# ── resume ──
-
-
-def test_a_restarted_controller_resumes_gains_and_reference_and_goes_there_from_where_the_body_is() -> None:
-    before = of("resume")
-    before.begin()
-    asked(before)
-    kept = before.live.record.model_copy(update={"ended": TripCause.HOLDER_GONE, "ended_tick": before.k})
-    loop = of("resume")
-    assert start(loop, 30.0, kept) == pytest.approx(30.0, abs=1.0)
-    assert loop.controller.gains == GAINS
-    way = loop.changes()[-1]
-    assert way.start is not None
-    assert way.within_s >= 3.0  # no faster than the operator asked for
-    reached(loop, 30.0)
-    assert loop.live.record.reference == TARGET
-    assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("resumed", "resumed")
     loop.assert_it_runs_again()
 
 
-@pytest.mark.parametrize("away", [15.0, 90.0])
-def test_nothing_jumps_when_a_reference_is_resumed_however_near_it_is(away: float) -> None:
-    loop = of("resume")
-    first = start(loop, away, record(LEVEL))
-    assert len(loop.changes()) == 2
-    assert first == pytest.approx(away, abs=1.0)  # a level of ε is 0.9° wide
-    before, fastest = first, 0.0
-    for _ in range(3500):
-        loop.tick(turned(away))
-        fastest, before = max(fastest, abs(loop.yaw() - before) / PERIOD), loop.yaw()
-    assert fastest <= degrees(1.0) * 1.004  # the limit, whose ways are sampled
-    assert loop.yaw() == pytest.approx(0.0)
-
-
-def test_a_vehicle_that_an_operator_stopped_is_held_with_its_gains() -> None:
-    loop = of("resume")
-    start(loop, 30.0, record(TARGET, ended=TripCause.OPERATOR))
-    assert reached(loop, 30.0) == pytest.approx(30.0, abs=1.0)
-    assert (loop.controller.gains, loop.live.record.reference_from) == (GAINS, "held")
+CONFIGURED = gains_with()
+TOO_TILTED = Hold(attitude=(0.0, 70.0, 0.0))
 
 
 @pytest.mark.parametrize(
-    "last",
+    ("ran", "last", "found", "goes_to", "source", "gains"),
     [
-        None,
-        record(Hold()),
-        record(Hold(attitude=(0.0, 70.0, 0.0))),  # tilts too far
+        (False, None, 30.0, 30.0, "held", CONFIGURED),
+        (False, record(TARGET), 30.0, 60.0, "resumed", GAINS),
+        (False, record(LEVEL), 15.0, 0.0, "resumed", GAINS),  # however near it is
+        (False, record(LEVEL), 90.0, 0.0, "resumed", GAINS),
+        (False, record(TARGET, ended=TripCause.OPERATOR), 30.0, 30.0, "held", GAINS),
+        (True, None, 0.0, 60.0, "resumed", GAINS),  # the plant was restarted: its own session counts
+        (True, record(Hold()), 30.0, 30.0, "held", GAINS),  # and is not what the plant has as the last one
+        (True, record(TOO_TILTED), 30.0, 30.0, "held", GAINS),
     ],
 )
-def test_what_cannot_be_resumed_is_held(last: SessionRecord | None) -> None:
+def test_a_session_is_resumed_from_where_the_body_is_or_else_the_attitude_found_is_held(
+    ran: bool, last: SessionRecord | None, found: float, goes_to: float, source: str, gains: Gains
+) -> None:
     loop = of("resume")
-    if last is not None:  # its own last session is not what the plant has as the last one
-        loop.begin()
+    if ran:
+        start(loop, 0.0)
         asked(loop)
         loop.end()
-    start(loop, 30.0, last)
-    assert reached(loop, 30.0) == pytest.approx(30.0, abs=1.0)
-    assert loop.live.record.reference_from == "held"
-    assert len(loop.events("fault")) == (last is not None and last.reference != Hold())
-
-
-def test_a_controller_whose_plant_was_restarted_resumes_its_own_session() -> None:
-    loop = of("resume")
-    start(loop, 0.0)
-    asked(loop)
-    loop.end()
-    start(loop, 0.0)
-    reached(loop, 0.0)
-    assert (loop.live.record.reference, loop.controller.gains) == (TARGET, GAINS)
+    assert start(loop, found, last) == pytest.approx(found, abs=1.0)  # a level of ε is 0.9° wide
+    way = loop.changes()[-1]
+    assert way.start is not None
+    assert source == "held" or way.within_s >= 2.0  # no faster than the operator asked for
+    assert reached(loop, found) == pytest.approx(goes_to, abs=1.0 if source == "held" else 1e-6)
+    assert (loop.controller.gains, loop.live.record.reference_from) == (gains, source)
+    assert len(loop.events("fault")) == (last is not None and last.reference == TOO_TILTED)
+    loop.assert_it_runs_again()
 
 
 def test_a_stream_is_resumed_at_rest_where_the_body_is_and_no_earlier_set_point_moves_it() -> None:
@@ -183,9 +134,6 @@ def test_points_go_on_with_the_first_that_was_not_reached(
         assert isinstance(left, Points)
         assert left.attitudes == points.attitudes[ahead[0] :]
         assert left.times == pytest.approx([times[i] - times[ahead[0]] for i in ahead])
-
-
-# ── configured ──
 
 
 def test_configured_follows_the_configuration_at_first_and_then_what_the_last_session_followed() -> None:

@@ -28,13 +28,11 @@ def frame(k: int, code: int = 0, wire: WireSpec = WIRE) -> bytes:
 
 
 def arrival(k: int, code: int = 0, *, late_ns: int = 0, content: bytes | None = None) -> Arrival:
-    """The frame of tick k."""
     arrives_ns = k * PERIOD_NS + DELAY_NS + late_ns
     return Arrival(frame(k, code) if content is None else content, arrives_ns)
 
 
 def in_passing(tick: PlantTick) -> bool:
-    """Whether it is a frame that is no tick of its own."""
     return tick.received_as in (Received.LATE, Received.MALFORMED)
 
 
@@ -64,11 +62,9 @@ class Source:
 
     @property
     def ticks(self) -> list[int]:
-        """Ticks that were computed."""
         return [tick.tick for tick, _ in self.taken if not in_passing(tick)]
 
     def when(self, tick: int) -> int:
-        """When a tick came."""
         return next(at_ns for each, at_ns in self.taken if each.tick == tick and not in_passing(each))
 
 
@@ -78,7 +74,6 @@ def until(k: int) -> int:
 
 
 def heartbeats(last: int, codes: Mapping[int, int] | None = None) -> list[Arrival]:
-    """Arrivals of a plant whose code becomes what `codes` say at their ticks."""
     sender, code, sent = Sender("on_change", 15, COUNTERS), 0, []
     for k in range(last + 1):
         code = (codes or {}).get(k, code)
@@ -168,8 +163,6 @@ def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None
     ticks = source.run(7 * PERIOD_NS * 45)
     assert [(each.tick, each.frame) for each in ticks] == list(zip([*range(44), 45], contents, strict=True))
 
-
-# Where every tick has a frame
 
 PERIODIC = WireSpec()
 

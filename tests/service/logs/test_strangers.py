@@ -17,9 +17,8 @@ from aeroloop.service.logs.copies import recover
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.report.page import page
-from aeroloop.service.review.compare import read_runs
 from aeroloop.service.review.report import Findings
-from aeroloop.service.review.review import read
+from aeroloop.service.review.review import read, read_runs
 from tests.support.edited_log import Said, contents, rewrite
 from tests.support.every_message import MESSAGES
 from tests.support.hostile import TOKENS

@@ -13,8 +13,7 @@ import pytest
 from aeroloop.protocol.messages.models import Telemetry
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.laws.evaluation import initial_state
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
@@ -75,7 +74,7 @@ def check_by_telemetry(ticks: Ticks, log: Path, settings: Settings) -> None:
     ("kind", "wire"),
     [
         *(("adaptive", wire) for wire in WIRES),
-        *((kind, "mixed") for kind in (EXPRESSIONS, PYTHON, "adaptive-torque", f"{HERE}:Bare", f"{HERE}:BarePython")),
+        *((kind, "mixed") for kind in (EXPRESSIONS, PYTHON, "adaptive-torque", f"{HERE}:Bare")),
     ],
 )
 def test_a_log_of_any_law_and_wire_is_computed_again_as_it_was(kind: str, wire: str, tmp_path: Path) -> None:

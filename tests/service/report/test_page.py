@@ -22,7 +22,6 @@ BROKEN = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
 
 
 def texts_of(*reports: Report) -> list[str]:
-    """The texts of a page, outside of scripts and styles."""
     texts = re.split(r"<(?:script|style)\b.*?</(?:script|style)>|<[^>]+>", page(reports), flags=re.DOTALL)
     return [" ".join(unescape(text).split()) for text in texts if text.strip()]
 

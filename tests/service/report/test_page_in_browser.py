@@ -18,8 +18,7 @@ from aeroloop.service.report.page import page
 from aeroloop.service.review.report import Check, Line, Mark, Panel
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, with_faults
 
-PATIENCE_MS = 120_000
-"""Nothing here is about speed; a browser on a busy machine may take its time."""
+PATIENCE_MS = 120_000  # nothing here is about speed; a browser on a busy machine may take its time
 Open = Callable[[str], Page]
 
 
@@ -73,12 +72,10 @@ def two(open_page: Open) -> Page:
 
 
 def plot(opened: Page, name: str, expression: str) -> Any:
-    """The value of an expression of a group's `plot`."""
     return opened.locator(f".plot[data-name={name}]").evaluate(f"(plot) => {expression}")
 
 
 def wait_for(opened: Page, name: str, condition: str) -> None:
-    """Wait until a condition of a group's `plot` holds."""
     plot = f"const plot = document.querySelector('.plot[data-name={name}]');"
     opened.wait_for_function(f"() => {{ {plot} return {condition}; }}")
 

@@ -11,9 +11,8 @@ import pytest
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.report import figure_style
-from aeroloop.service.report.figure_style import FORMATS
-from aeroloop.service.report.plots import draw_figures
+from aeroloop.service.report import plots
+from aeroloop.service.report.plots import FORMATS, draw_figures
 from aeroloop.service.review.report import Report
 from aeroloop.service.review.review import read
 from tests.support.made_log import make_log
@@ -35,11 +34,10 @@ def quantized(log: Path) -> Report:
 @pytest.fixture
 def svg_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures in the one format that can be read here: each takes a while to draw."""
-    monkeypatch.setattr(figure_style, "FORMATS", {"svg": FORMATS["svg"]})
+    monkeypatch.setattr(plots, "FORMATS", {"svg": FORMATS["svg"]})
 
 
 def only(made: Report, group: str) -> Report:
-    """A report with this group alone: each figure takes a while to draw."""
     return replace(made, panels=[panel for panel in made.panels if panel.group == group])
 
 

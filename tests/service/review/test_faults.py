@@ -65,9 +65,6 @@ def test_the_verdict_names_the_faults_and_a_review_lists_them_before_the_figures
     assert text.index("command:drop=0.3@0.2..0.6 0.200 s 0.600 s") < text.index(" z_track ")
 
 
-# ── several sessions and processes ──
-
-
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of 50 ticks without a status, which begins at the plant's tick 100."""

@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status
 from aeroloop.protocol.messages.trace import Outcome, Received, read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.review.observations import gaps
+from aeroloop.service.review.events import gaps
 from aeroloop.service.review.report import Check, Findings
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import LOCKSTEP, read
@@ -26,9 +26,6 @@ from tests.support.made_log import AHEAD_NS, SESSION, START_NS, make_log
 
 def found(path: Path) -> Findings:
     return read(path).findings
-
-
-# What happened
 
 
 def event(at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None) -> Said:
@@ -135,9 +132,6 @@ def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tm
     assert marks[-1].text == "600 more, the last: no 899"
 
 
-# Gaps
-
-
 def test_ticks_that_no_command_answered_are_gaps_whether_they_were_measured_or_not(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS, settings=load(), lost=range(50, 53), skipped=range(200, 240))
     findings = found(tmp_path / "a.mcap")
@@ -151,9 +145,6 @@ def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None
     assert count == 3000
     assert sorted(gap.ticks for gap in longest) == sorted(lengths)[-100:]
     assert [gap.tick for gap in longest] == sorted(gap.tick for gap in longest)
-
-
-# Timing
 
 
 def test_latency_and_period_are_those_of_the_plants_own_clock(whole: Path, tmp_path: Path) -> None:
@@ -201,9 +192,6 @@ def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: 
     assert "controller" in found(whole).reasons["age_us"]
 
 
-# Saturation, and what is no value
-
-
 def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Path) -> None:
     """The gyro fails for seven ticks; the controller answers with commands without a valid value."""
     faults = 'plant.faults=["rate.x:off@0.86..0.874"]'
@@ -211,9 +199,6 @@ def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Pat
     findings = found(tmp_path / "a.mcap")
     assert findings.invalid == {"measurement": 7, "command": 7}
     assert (findings.gap_count, findings.skipped_ticks) == (0, 0)
-
-
-# The whole
 
 
 def test_the_exit_code_reports_whether_limits_hold(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -230,16 +215,3 @@ def test_what_is_no_limit_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(LimitError) as refused:
         Limit.parse(text)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_the_account_lists_trips_before_figures_and_what_does_not_hold(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
-    more = [event(0.41, "plant", "tripped", "the [red] limit")]
-    path = rewrite(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
-    assert execute(["log", "review", str(path), "--require", "gap_count=0"]) == 1
-    out = " ".join(capsys.readouterr().out.split())
-    assert out.index("0.410 s plant tripped the [red] limit") < out.index(" z_track ")
-    assert "gaps 1, the longest 3 ticks at 0.100 s" in out
-    assert "✗ gap_count ≤ 0 1" in out

@@ -19,12 +19,10 @@ from aeroloop.service.review.theorem import check_theorem
 from tests.service.review.conftest import TICKS
 from tests.support.edited_log import LATENCY_NS, PERIOD_NS, at_rest
 
-Drawn = dict[tuple[str, str], Line]
-"""Lines by the label of their panel's axis, and their own."""
+Drawn = dict[tuple[str, str], Line]  # lines by the label of their panel's axis, and their own
 
 
 def drawn(ticks: Ticks, truths: Truths = NO_TRUTHS) -> Drawn:
-    """What is drawn of ticks of the default configuration."""
     _, panels, _ = panels_of(load(), ticks, check_theorem(load(), ticks, truths))
     return {(panel.label, line.label): line for panel in panels for line in panel.lines}
 

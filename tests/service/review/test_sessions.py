@@ -16,8 +16,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.compare import Comparison, read_runs
-from aeroloop.service.review.review import read, review
+from aeroloop.service.review.review import Comparison, read, read_runs, review
 from tests.support.edited_log import message_of, rewrite
 from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, make_log, write
 
@@ -30,7 +29,6 @@ def of_vehicle(messages: list[Logged], vehicle: str) -> list[Logged]:
 
 
 def described(settings: Settings, role: str, vehicle: str = VEHICLE, at_ns: int = 0) -> Logged:
-    """A description as a message."""
     text = description(settings, role).model_copy(update={"vehicle": vehicle}).model_dump_json()
     return Logged(START_NS + at_ns, topics.key("description", vehicle, role=role), text.encode(), START_NS + at_ns)
 
@@ -59,9 +57,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rewrite(path.with_name("plain"), path, more=trips)
     path.with_name("plain").unlink()
     return path
-
-
-# Sessions and vehicles
 
 
 def test_the_longest_session_is_judged_unless_one_is_named_or_numbered(log: Path) -> None:
@@ -102,11 +97,7 @@ def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_l
     assert "sessions 1 is s1, 0.4 s; 2 is s2, 0.2 s; --session N shows another" in out
 
 
-# Runs
-
-
 def recorded(path: Path, messages: list[Logged], identity: str | None) -> Path:
-    """A log that a recorder of this identity wrote."""
     settings = load()
     write(path.with_suffix(".plain"), settings, messages)
     entry = {"json": f'{{"run": "a", "part": "a", "id": "{identity}"}}'}
@@ -139,9 +130,6 @@ def test_what_a_restarted_recorder_wrote_is_one_run(tmp_path: Path) -> None:
     assert len(Recording([later, *parts]).extents) == 2
 
 
-# Whose settings
-
-
 def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_findings(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -160,9 +148,6 @@ def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_fin
     assert execute(["log", "review", str(path)]) == 0
     out = " ".join(capfd.readouterr().out.split())
     assert f"ends disagree plant.aero.mass: controller {controller.plant.aero.mass}, plant 2.0" in out
-
-
-# Comparisons
 
 
 @pytest.fixture(scope="module")

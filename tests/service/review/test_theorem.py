@@ -22,17 +22,13 @@ from aeroloop.service.review.theorem import TheoremCheck, check_theorem, judged_
 from aeroloop.service.theorem import certificate
 from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
+from tests.support.certified import FREE, bits
 from tests.support.edited_log import Said, at_rest, message_of, rewrite
 from tests.support.ideal import IDEAL
-from tests.support.made_log import SESSION, START_NS, description, make_log
+from tests.support.made_log import SESSION, START_NS, description, lockstep, make_log
 
 TICKS = 4000
-CERTIFIED = (
-    "plant.kind=rigid_body", *IDEAL, "plant.rigid_body.damping=[0.006, 0.005, 0.007]", "wire.actuators=3",
-    "law.damping_bound=0.0119", "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]",
-    "law.centre_of_mass=[0, 0, 0]", *(f"wire.{name}.bits=12" for name in ("attitude", "rate", "voltage")),
-)  # fmt: skip
-"""A free body for which the certificate holds."""
+CERTIFIED = (*FREE, *bits(12, 12), "plant.rigid_body.damping=[0.006, 0.005, 0.007]")
 
 
 def settled(*overrides: str) -> Settings:
@@ -42,10 +38,6 @@ def settled(*overrides: str) -> Settings:
     rate = [radians(a) * f for a, f in zip(reference.amplitude, reference.frequency, strict=True)]
     begins = f"plant.rigid_body.rate={rate}", "law.damping_estimate=[0.006, 0.005, 0.007]"
     return load(overrides=[*CERTIFIED, *begins, *overrides])
-
-
-def lockstep(*overrides: str) -> Settings:
-    return load(overrides=["loop.lockstep=true", *overrides])
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +60,6 @@ def judged(path: Path) -> tuple[Findings, TheoremFindings]:
     findings = read(path).findings
     assert findings.theorem is not None
     return findings, findings.theorem
-
-
-# Lemma 1
 
 
 def test_on_the_papers_plant_every_inequality_holds_at_every_tick(ideal: Path) -> None:
@@ -120,9 +109,6 @@ def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_
     assert late.outside["C.29"] > 250
 
 
-# The set
-
-
 def test_a_certified_body_stays_within_the_set_that_it_entered(certified: Path) -> None:
     findings, theorem = judged(certified)
     assert (theorem.holds, theorem.held, theorem.broken, theorem.outside["C.30"]) == (True, True, 0, 0)
@@ -168,9 +154,6 @@ def test_with_faults_at_the_plant_only_the_lemma_is_judged(tmp_path: Path) -> No
     assert findings.reasons["theorem.pointwise_share"] == "faults acted at the plant"
 
 
-# From when until when
-
-
 def change(tick: int, **parts: Any) -> Change:
     return Change(session=SESSION, tick=tick, **parts)
 
@@ -193,9 +176,6 @@ def test_a_session_is_judged_from_the_end_of_its_approach_until_the_next_change(
     changes: list[Change], span: tuple[int, float]
 ) -> None:
     assert judged_ticks(changes, 0.002) == span
-
-
-# What is promised
 
 
 def held(settings: Settings, **values: float) -> dict[str, Any]:

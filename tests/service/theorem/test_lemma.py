@@ -92,14 +92,18 @@ def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats
     attitude, rate = wire.attitude.quantizer(), wire.rate.quantizer()
     sent = [sent_vector((w, x, y, z)) for w, x, y, z in q.tolist()]
     q_Q = np.array([received_quaternion(*_quantized(attitude, eps), IDENTITY) for eps in sent])
-    omega_Q = np.array([[rate.quantize(value) for value in row] for row in omega.tolist()])
+    omega_Q = np.array([[rate.level(rate.encode(value)) for value in row] for row in omega.tolist()])
     sign = np.where((q * q_d).sum(axis=1) * (q * q_Q).sum(axis=1) >= 0, 1.0, -1.0)
     return Samples(q, omega, q_Q, omega_Q, q_d, omega_d, sign), omega_d_dot
 
 
 def _quantized(quantizer: Quantizer, vector: Vector) -> Vector:
     x, y, z = vector
-    return quantizer.quantize(x), quantizer.quantize(y), quantizer.quantize(z)
+    return (
+        quantizer.level(quantizer.encode(x)),
+        quantizer.level(quantizer.encode(y)),
+        quantizer.level(quantizer.encode(z)),
+    )
 
 
 def _edge_before(half_angle: float, wire: WireSpec) -> float:
@@ -154,7 +158,7 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
         args = x.q_d[i], x.omega_d[i], omega_d_dot[i], estimate[i], x.sign[i]
         seen = twin.law(body, x.q_Q[i], x.omega_Q[i], *args)
         true = twin.law(body, q[i], x.omega[i], *args)
-        u = np.array([voltage.quantize(value) for value in seen.u])
+        u = np.array([voltage.level(voltage.encode(value)) for value in seen.u])
         R, J, omega = twin.rotation(q[i]).T, body.J, x.omega[i]
         gravity = np.cross(body.r_g, R @ np.array([0.0, 0.0, -body.m * body.g]))
         J_omega_dot = -np.cross(omega, J @ omega) + gravity - omega * theta[i] + body.B @ u + torque[i]

@@ -84,7 +84,7 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
     for sent, shown, saturated in ((24.0, VOLTS.outermost, True), (None, None, None)):
         (command,) = configured().take(address("command"), frame(WIRE.command, [VOLTS, VOLTS], [sent, -3.0]), NOW)
         values = said(command)
-        expected = [shown, VOLTS.quantize(-3.0)]
+        expected = [shown, VOLTS.level(VOLTS.encode(-3.0))]
         assert [values["voltage_2_v"], values["voltage_3_v"]] == [v and pytest.approx(v, abs=1e-4) for v in expected]
         assert (values["saturated_2"], values["saturated_3"], values["voltage_1_v"]) == (saturated, False, None)
 

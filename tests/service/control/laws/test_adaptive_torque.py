@@ -13,16 +13,12 @@ import pytest
 from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive_torque import AdaptiveTorqueSettings
-from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.interface import LawSettings
-from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.lab.experiment import run_experiment
-from tests.service.control.laws.test_baselines import BODY, unit
-from tests.support import numpy_twin as twin
-from tests.support.adversary_loop import times as product
+from tests.service.control.laws.test_baselines import BODY
+from tests.support.law_tick import Tick, acceleration, errors, errors_at, unit
 from tests.support.numpy_twin import Array
 
-PERIOD, WIDTH = 0.002, 0.5
+WIDTH = 0.5
 FIRST = np.array([0.1, 0.2, 0.3])  # of the damping
 
 
@@ -36,25 +32,6 @@ def body(rng: np.random.Generator) -> dict[str, Any]:
         "damping_estimate": FIRST,
         "voltage_limit": 1e9,
     }
-
-
-class Tick:
-    """One tick of a law on three motors: the torque B u [N·m] and the next state."""
-
-    def __init__(self, settings: LawSettings, period: float = PERIOD) -> None:
-        law: Any = law_of(settings, period, 3)
-        self._function, self._B = law_function(law), np.array(settings.allocation)
-        self._gains = [value for gain in configured_gains(law).values() for value in gain]
-        self.first = np.concatenate(list(initial_state(law).values()))
-
-    def __call__(self, state: Array, q: Array, omega: Array, *desired: Array) -> tuple[Array, Array]:
-        eps = q[1:] if q[0] >= 0 else -q[1:]
-        found = self._function(q, state, self._gains, eps, omega, *desired)
-        return self._B @ np.array(found[1]).ravel(), np.array(found[2]).ravel()
-
-
-def errors(q: Array, omega: Array, q_d: Array, omega_d: Array) -> tuple[Array, Array]:
-    return product(q_d * [1, -1, -1, -1], q), omega - twin.rotation(q).T @ omega_d
 
 
 def descent(rng: np.random.Generator, pressed: bool) -> tuple[float, float, float]:
@@ -76,17 +53,13 @@ def descent(rng: np.random.Generator, pressed: bool) -> tuple[float, float, floa
     sign = 1.0 if errors(q, omega, q_d, omega_d)[0][0] >= 0 else -1.0
 
     period = 1e-6  # so short that a step is a rate
-    torque, after = Tick(p, period)(np.array([sign, *learned.ravel()]), q, omega, q_d, omega_d, omega_d_dot)
-    rates = (after[1:].reshape(3, 3) - learned) / period
-    weight = twin.rotation(q).T @ np.array([0, 0, -p.mass * p.gravity])
+    found = Tick(p, period)(np.array([sign, *learned.ravel()]), q, omega, q_d, omega_d, omega_d_dot)
+    rates = (found["state_next"][1:].reshape(3, 3) - learned) / period
     friction = theta[1] * omega + theta[2] * np.tanh(omega / WIDTH)
-    omega_dot = (torque + np.cross(p.centre_of_mass, weight) - np.cross(omega, J * omega) - friction + theta[0]) / J
+    omega_dot = acceleration(p, q, omega, np.array(p.allocation) @ found["u"] - friction + theta[0])
 
     def lyapunov(t: float) -> tuple[float, Array, Array]:
-        """V, ε̃ and z₂ a little later."""
-        here = q + t / 2 * product(q, np.append(0, omega))  # of length 1 but for t²
-        there = q_d + t / 2 * product(np.append(0, omega_d), q_d)
-        e, omega_e = errors(here, omega + t * omega_dot, there, omega_d + t * omega_d_dot)
+        e, omega_e = errors_at(t, q, omega, omega_dot, q_d, omega_d, omega_d_dot)
         z2 = omega_e + C1 * sign * e[1:]
         wrong = theta - learned - t * rates
         return 2 * k1 * (1 - sign * e[0]) + z2 @ (J * z2) / 2 + (wrong**2 / Gamma).sum() / 2, e[1:], z2

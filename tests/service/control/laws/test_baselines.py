@@ -14,94 +14,57 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from aeroloop.protocol.wire.attitude import IDENTITY
-from aeroloop.service.config import load, load_over
+from aeroloop.service.config import load
 from aeroloop.service.control.laws.baselines import TUNED, Response, nearer, optimal_gain, response_of, tuned
-from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.registry import CustomLawSettings, law_of, law_settings
+from aeroloop.service.control.laws.registry import (
+    CustomLawSettings,
+)
 from aeroloop.service.lab.experiment import experiment
-from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
 from tests.support.ideal import IDEAL
+from tests.support.law_tick import Tick, acceleration, unit, weight_torque
 from tests.support.numpy_twin import Array
 
 BASELINES = [*TUNED, "nonadaptive"]
 PERIOD = 0.002
 
 
-def unit(rng: np.random.Generator) -> Array:
-    q = rng.normal(size=4)
-    return np.asarray(q / np.linalg.norm(q))
-
-
 class Body:
-    """A body, and a law that knows it."""
-
     def __init__(self, kind: str, rng: np.random.Generator, **fields: Any) -> None:
         B = (rng.normal(size=(3, 3)) + 3 * np.eye(3)) / 10  # well away from singular
         body = CustomLawSettings(
-            kind=kind,
-            inertia=tuple(rng.uniform(0.5, 2, 3)),
-            mass=rng.uniform(0.5, 2),
-            centre_of_mass=tuple(rng.normal(size=3)),
-            allocation=B.tolist(),
-        )
-        self.response = Response(tuple(rng.uniform(1, 3, 3)), tuple(rng.uniform(0.75, 1.5, 3)))
-        known = {"damping_estimate": tuple(rng.uniform(0, 0.1, 3))}
-        section = CustomLawSettings(**body.model_dump() | tuned(kind, body, self.response) | known | fields)
-        self.p: Any = law_settings(section)
-        law: Any = law_of(section, PERIOD, 3)
-        self.function = law_function(law)
-        self.gains, state = values_of(law)
-        self.state = np.array(state)
-        self.J, self.B, self.theta = np.array(self.p.inertia), B, np.array(known["damping_estimate"])
-
-    def law(self, q: Array, omega: Array, q_d: Array, omega_d: Array, omega_d_dot: Array, state: Array) -> Any:
-        """Torque B u and the next state."""
-        eps, last = (q[1:], q) if q[0] >= 0 else (-q[1:], q)
-        found = self.function(
-            last=last, state=state, gains=self.gains, eps=eps, omega=omega, q_d=q_d, omega_d=omega_d,
-            omega_d_dot=omega_d_dot,
+            kind=kind, inertia=tuple(rng.uniform(0.5, 2, 3)), mass=rng.uniform(0.5, 2),
+            centre_of_mass=tuple(rng.normal(size=3)), allocation=B.tolist(),
         )  # fmt: skip
-        return self.B @ np.array(found["u"]).ravel(), np.array(found["state_next"]).ravel()
+        self.response = Response(tuple(rng.uniform(1, 3, 3)), tuple(rng.uniform(0.75, 1.5, 3)))
+        self.theta = rng.uniform(0, 0.1, 3)
+        known = {"damping_estimate": tuple(self.theta)}
+        section = CustomLawSettings(**body.model_dump() | tuned(kind, body, self.response) | known | fields)
+        self.tick, self.B = Tick(section), B
 
-    def omega_dot(self, q: Array, omega: Array, torque: Array) -> Array:
-        """(C.2), from the twin's rotation."""
-        p = self.p
-        weight = twin.rotation(q).T @ np.array([0, 0, -p.mass * p.gravity])
-        gravity = np.cross(p.centre_of_mass, weight)
-        moment = torque + gravity - np.cross(omega, self.J * omega) - self.theta * omega
-        return np.asarray(moment / self.J)
+    def moved(self, q: Array, omega: Array, q_d: Array, state: Array) -> tuple[Array, Array]:
+        found = self.tick(state, q, omega, q_d, np.zeros(3), np.zeros(3))
+        torque = self.B @ found["u"] - self.theta * omega
+        return acceleration(self.tick.law.settings, q, omega, torque), found["state_next"]
 
 
 def slope_of(value: Any, h: float = 1e-6) -> Any:
-    """Central difference of a function at 0."""
     return (value(h) - value(-h)) / (2 * h)
-
-
-def values_of(law: Any) -> tuple[list[float], list[float]]:
-    """Configured gains and first state of a law, each one below the other."""
-    return [x for gain in configured_gains(law).values() for x in gain], [
-        x for part in initial_state(law).values() for x in part
-    ]
 
 
 @pytest.mark.parametrize("kind", BASELINES)
 @pytest.mark.parametrize("motors", [2, 3])
 def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, motors: int) -> None:
-    law: Any = law_of(load(overrides=[f"law.kind={kind}"]).law, PERIOD, motors)
-    q = np.array([np.sqrt(1 - 0.05), 0.0, 0.2, -0.1])
-    gains, state = values_of(law)
-    still = dict.fromkeys(("omega", "omega_d", "omega_d_dot"), [0.0] * 3)
+    tick, zero = Tick(load(overrides=[f"law.kind={kind}"]).law, PERIOD, motors), np.zeros(3)
+    q, p = np.array([np.sqrt(1 - 0.05), 0.0, 0.2, -0.1]), tick.law.settings
     for q_d in (q, -q):  # the same attitude
-        found = law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=q_d, **still)
-        p = law.settings
-        weight = np.cross(p.centre_of_mass, twin.rotation(q).T @ np.array([0, 0, -p.mass * p.gravity]))
-        u = np.array(found["u"]).ravel()
-        assert u.shape == (motors,)
-        assert (np.array(p.allocation)[3 - motors :, 3 - motors :] @ u) == pytest.approx(-weight[3 - motors :])
-        sign, *rest = np.array(found["state_next"]).ravel()
+        found = tick(tick.first, q, zero, q_d, zero, zero)
+        assert found["u"].shape == (motors,)
+        held = np.array(p.allocation)[3 - motors :, 3 - motors :] @ found["u"]
+        assert held == pytest.approx(-weight_torque(p, q)[3 - motors :])
+        sign, *rest = found["state_next"]
         assert sign == (1 if q_d is q else -1)
-        assert rest == state[1:]
+        assert rest == tick.first[1:].tolist()
 
 
 POLES: dict[str, Callable[[float, Any], Any]] = {
@@ -119,21 +82,21 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
     rng = np.random.default_rng(1)
     C1, C2 = (0.9, 1.2, 0.6), (1.5, 2.0, 1.0)
     body = Body(kind, rng, **({"C1": C1, "C2": C2} if kind == "nonadaptive" else {}))
-    response = response_of(body.p.inertia, C1, C2) if kind == "nonadaptive" else body.response
-    q_d, zero = unit(rng), np.zeros(3)
-    extra = len(body.state) - 1
+    inertia = body.tick.law.settings.inertia
+    response = response_of(inertia, C1, C2) if kind == "nonadaptive" else body.response
+    q_d, first = unit(rng), body.tick.first
+    extra = len(first) - 1
     for axis in range(3):
 
         def derivative(x: Array, axis: int = axis) -> Array:
-            """Of the axis's angle, rate and further state."""
-            error, omega, state = np.zeros(3), np.zeros(3), body.state.copy()
+            error, omega, state = np.zeros(3), np.zeros(3), first.copy()
             error[axis], omega[axis], state[0] = x[0] / 2, x[1], 1.0
             if extra:
                 state[1 + axis] = x[2]
             q = product(q_d, np.append(np.sqrt(1 - error @ error), error))
-            torque, after = body.law(q, omega, q_d, zero, zero, state)
+            omega_dot, after = body.moved(q, omega, q_d, state)
             further = [(after[1 + axis] - state[1 + axis]) / PERIOD] if extra else []
-            return np.array([x[1], body.omega_dot(q, omega, torque)[axis], *further])
+            return np.array([x[1], omega_dot[axis], *further])
 
         one_by_one = np.eye(2 + bool(extra))
         A = np.column_stack([slope_of(lambda h, x=x: derivative(h * x)) for x in one_by_one])
@@ -142,39 +105,6 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
         expected = POLES.get(kind, POLES["pd"])(wn, pair)
         # the regulator's gains are for ticks of a period: off by a part of ωₙT
         assert np.poly(A) == pytest.approx(np.poly(expected), rel=3 * wn * PERIOD if kind == "lqr" else 1e-4)
-
-
-@pytest.mark.parametrize("kind", ["pd", "sliding"])
-def test_far_from_the_reference_the_error_moves_as_the_law_promises(kind: str) -> None:
-    """V of PD falls by the damping alone; the sliding law moves straight to its surface."""
-    rng = np.random.default_rng(2)
-    body = Body(kind, rng, **({"kp": (1.3, 1.3, 1.3), "kd": (0.5, 0.9, 0.7)} if kind == "pd" else {}))
-    for _ in range(5):
-        q, q_d, omega, omega_d, omega_d_dot = unit(rng), unit(rng), *rng.normal(size=(3, 3))
-        if product(q_d * [1, -1, -1, -1], q)[0] < 0:
-            q_d = -q_d
-        torque, _ = body.law(q, omega, q_d, omega_d, omega_d_dot, body.state)
-        omega_dot = body.omega_dot(q, omega, torque)
-
-        def at(t: float, motion: Any = (q, q_d, omega, omega_d, omega_dot, omega_d_dot)) -> tuple[Array, Array]:
-            """Error quaternion and rate error a little later."""
-            q, q_d, omega, omega_d, omega_dot, omega_d_dot = motion
-            turned, desired = (
-                q + t / 2 * product(q, np.append(0, omega)),
-                q_d + t / 2 * product(np.append(0, omega_d), q_d),
-            )
-            turned, desired = turned / np.linalg.norm(turned), desired / np.linalg.norm(desired)
-            rate_error = omega + t * omega_dot - twin.rotation(turned).T @ (omega_d + t * omega_d_dot)
-            return product(desired * [1, -1, -1, -1], turned), rate_error
-
-        if kind == "pd":
-            falling = slope_of(lambda t, at=at: 2 * 1.3 * (1 - at(t)[0][0]) + at(t)[1] @ (body.J * at(t)[1]) / 2)
-            assert falling == pytest.approx(-at(0)[1] @ (np.array(body.p.kd) * at(0)[1]), rel=1e-6)
-        else:
-            slope, K, layer = (np.array(getattr(body.p, name)) for name in ("slope", "strength", "layer"))
-            sigma = at(0)[1] + slope * at(0)[0][1:]
-            towards = body.J * slope_of(lambda t, at=at, slope=slope: at(t)[1] + slope * at(t)[0][1:])
-            assert towards == pytest.approx(-K * np.tanh(sigma / layer), rel=1e-6)
 
 
 def test_the_other_equilibrium_is_approached_only_once_it_is_nearer_by_the_hysteresis() -> None:
@@ -190,15 +120,12 @@ def test_where_a_motor_saturates_the_integral_gives_way_and_else_it_does_not(kin
         """Integral torque [N·m] after an error of 30° that no command moves, for 20 s. Shape (3,)."""
         overrides = [f"law.kind={kind}", f"law.{gain}=[0.2, 0.2, 0.2]", f"law.reset_time={[reset_time] * 3}"]
         overrides += ["law.torque_bound=[9, 9, 9]"] if kind == "adaptive-torque" else []
-        law: Any = law_of(load(overrides=overrides).law, 0.02, 2)
-        function, (gains, first) = law_function(law), values_of(law)
-        state = ca.DM(first)
-        turned = {"omega": [0.0] * 3, "omega_d": [0.0] * 3, "omega_d_dot": [0.0] * 3, "q_d": IDENTITY}
+        tick, zero = Tick(load(overrides=overrides).law, 0.02, 2), np.zeros(3)
+        state, q = tick.first, np.array([np.sqrt(1 - 2 * 0.18**2), 0, 0.18, 0.18])
         for _ in range(1000):
-            answer = function(last=IDENTITY, state=state, gains=gains, eps=[0, 0.18, 0.18], **turned)
-            state = answer["state_next"]
-        assert np.array(state).ravel()[4:].tolist() == first[4:]  # no friction is learned
-        integral: Array = np.array(state).ravel()[1:4] * (law.settings.ki if kind == "pid" else 1)
+            state = tick(state, q, zero, np.array(IDENTITY), zero, zero)["state_next"]
+        assert state[4:].tolist() == tick.first[4:].tolist()  # no friction is learned
+        integral: Array = state[1:4] * (tick.law.settings.ki if kind == "pid" else 1)
         return np.abs(integral[1:])
 
     assert (held(1e9) > 5 * held(0.2)).all()
@@ -206,20 +133,14 @@ def test_where_a_motor_saturates_the_integral_gives_way_and_else_it_does_not(kin
 
 
 def test_without_adaptation_the_voltages_are_the_papers_with_its_first_estimate() -> None:
-    settings = load(overrides=["law.damping_estimate=[0.01, 0.02, 0.03]"])
-    laws: list[Any] = [
-        law_of(load_over(settings, overrides).law, PERIOD, 2)
-        for overrides in ([], ["law.kind=nonadaptive", "law.damping_estimate=[0.01, 0.02, 0.03]"])
-    ]
+    known = "law.damping_estimate=[0.01, 0.02, 0.03]"
     rng = np.random.default_rng(5)
-    motion = dict(zip(("omega", "omega_d", "omega_d_dot"), rng.normal(size=(3, 3)), strict=True))
-    q = np.abs(unit(rng))
-    found = []
-    for law in laws:
-        gains, state = values_of(law)
-        found.append(law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=q, **motion))
-    assert np.array(found[0]["u"]).tolist() == np.array(found[1]["u"]).tolist()
-    assert laws[1].initial().keys() == {"sign"}
+    q, (omega, omega_d, omega_d_dot) = np.abs(unit(rng)), rng.normal(size=(3, 3))
+    papers, its = (
+        tick(tick.first, q, omega, q, omega_d, omega_d_dot)["u"]
+        for tick in (Tick(load(overrides=[f"law.kind={kind}", known]).law) for kind in ("adaptive", "nonadaptive"))
+    )
+    assert papers.tolist() == its.tolist()
 
 
 BODY = (
