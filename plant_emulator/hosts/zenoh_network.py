@@ -27,10 +27,10 @@ from aeroloop.plant_emulator.plant import Plant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord, Status
-from aeroloop.protocol.messages.operator import Advance, Answer, Inject, MessageError, Request
+from aeroloop.protocol.messages.operator import Advance, Answer, Inject, Mark, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
-from aeroloop.protocol.runtime.node import Node, RecorderWatch
+from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -105,7 +105,8 @@ class ZenohNetwork(PlantNetwork):
         role.serve("record", SessionRecord, self._keep_record)
         role.serve("show", Request, lambda _: self._show)
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
-        role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
+        role.serve("stop", Request, lambda _: self._once_kept(self._stop))
+        role.serve("mark", Mark, lambda mark: lambda: self._mark(mark.text))
         if self._computed:
             role.serve("inject", Inject, lambda request: lambda: self._inject(request))
             role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
@@ -248,6 +249,7 @@ class ZenohNetwork(PlantNetwork):
     def _inject(self, request: Inject) -> Answer:
         assert self._plant_end is not None
         done = self._plant_end.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
+        self.follow_session()  # here, so that its events name the operator
         return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
     def _advance(self, seconds: float) -> Answer:
@@ -279,9 +281,17 @@ class ZenohNetwork(PlantNetwork):
             return Answer(done=True, text=f"{vehicle} is armed: the next controller to claim it may drive it")
         return Answer(done=False, text=f"{vehicle} is held by {self._endpoint.holder}, so there is nothing to arm")
 
-    def _stop(self, by: str | None) -> Answer:
+    def _stop(self) -> Answer:
+        by = ASKED_BY.get()
         self._endpoint.stop(reason=f"stopped by an operator ({by})" if by else "stopped by an operator")
         return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
+
+    def _mark(self, text: str) -> Answer:
+        tick = self._endpoint.event_tick
+        self._role.event("marked", text, self._endpoint.session, tick)
+        if not self._recorder.present:
+            return Answer(done=False, text="no recorder runs: the mark is in a log only if one starts within a minute")
+        return Answer(done=True, text=f"marked{'' if tick is None else f' at tick {tick}'}: {text}")
 
     def _once_kept(self, change: Callable[[], Answer]) -> Callable[[], Answer]:
         """Queue a change of the latch, and answer when it is on disk. Waits in the topic's thread, not in the loop."""

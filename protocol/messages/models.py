@@ -18,7 +18,7 @@ PROTOCOL_VERSION: Final = 2
 STATUS_VALUES: Final = 2048  # values of a status with 128 faults, twice
 
 EventKind = Literal[
-    "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
+    "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault", "marked"
 ]
 Source = Literal["configured", "operator", "resumed", "held"]
 """Where gains or a reference come from: the configuration, an operator, the session before, or the attitude found."""
@@ -250,7 +250,9 @@ class Event(Message):
 
     role: str
     kind: EventKind
-    text: str = Field(description="one line for a person: what, why, and since when, if available")
+    text: str = Field(
+        description="one line for a person: what, why, since when, and which operator asked for it, if available"
+    )
     session: str | None = None
     tick: int | None = Field(default=None, description="the session's tick at which it happened, if any")
 

@@ -191,12 +191,18 @@ def _printable(text: str) -> str:
     return text
 
 
+Line = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
+"""A line for people to read."""
+
+
 class Request(Message):
     """A request without arguments: arm, stop, stand down, recall."""
 
-    by: Annotated[str, Field(max_length=64), AfterValidator(_printable)] | None = Field(
-        default=None, description="stop: name for people to read, such as user@host; not authenticated"
-    )
+
+class Mark(Message):
+    """A mark in the log."""
+
+    text: Line = Field(description="what an operator wants to find again")
 
 
 class Track(Message):

@@ -21,7 +21,7 @@ from aeroloop.protocol.messages.models import (
     Telemetry,
     Truth,
 )
-from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Setpoint, Track
+from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Mark, Message, Setpoint, Track
 
 ROOT: Final = "aeroloop"
 RoleName = Literal["plant", "controller", "operator", "observer", "recorder"]
@@ -87,6 +87,7 @@ TOPICS: Final = {
         Topic("stand_down", "stand-down", "query", _OPERATOR, _CONTROLLER),
         Topic("recall", "recall", "query", _OPERATOR, _CONTROLLER),
         Topic("show", "show", "query", _READERS, _ENDS, limit=POINTS_BYTES),
+        Topic("mark", "mark", "query", _OPERATOR, _PLANT, Mark),
         Topic("set_gains", "set-gains", "query", _OPERATOR, _CONTROLLER, Gains),
         Topic("track", "track", "query", _OPERATOR, _CONTROLLER, Track, request=POINTS_BYTES),
         Topic("inject", "inject", "query", _OPERATOR, _PLANT, Inject),

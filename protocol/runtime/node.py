@@ -10,6 +10,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from contextvars import ContextVar, copy_context
+from functools import partial
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -32,6 +34,9 @@ Action = Callable[[], object]  # a function to run between two ticks
 AT_ONCE: Final = 8  # actions that run between two ticks; the others wait
 WAITING: Final = 64  # queries that may wait to be answered between ticks; more are refused
 LONG_S: Final = 10.0  # least time between two requests of a topic that take longer than a fraction of a tick to parse
+ASKER_LENGTH: Final = 100  # most characters of an operator's name
+ASKED_BY: Final = ContextVar("asked by", default="")
+"""The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
 _RECENT_S: Final = 10.0
 _SELDOM_PER_S: Final = 8.0  # cached messages of a topic that was not declared beforehand: statuses, events
 _GRAVE: Final = ("tripped", "lost", "fault", "refused")
@@ -53,6 +58,14 @@ def log_event(event: Event, vehicle: str | None) -> None:
     level = logging.WARNING if event.kind in _GRAVE else logging.INFO
     fields = event.model_dump(include={"role", "session", "tick"})
     log.log(level, event.text, extra={"event": event.kind, "vehicle": vehicle, **fields})
+
+
+def _asker(query: zenoh.Query) -> str:
+    """The operator in a query's attachment; empty if it has none, or none to print."""
+    with suppress(UnicodeDecodeError):
+        name = query.attachment.to_bytes().decode() if query.attachment else ""
+        return name if len(name) <= ASKER_LENGTH and name.isprintable() else ""
+    return ""
 
 
 class Node:
@@ -120,7 +133,8 @@ class Node:
         A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
         is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
         `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
-        returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
+        returns runs between ticks and returns the reply. An AeroloopError from either is the reply. Both run in the
+        context of the operator in the query's attachment, `ASKED_BY`.
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
@@ -145,9 +159,13 @@ class Node:
                 if len(self._inbox) >= WAITING:
                     raise MessageError(f"{WAITING} requests wait already; ask again")
                 action = prepare(self._read(topic, model, payload))
-                self._inbox.append(lambda: reply(query, action))
+                self.enqueue(lambda: reply(query, action))
 
-            reply(query, accept)
+            asked = ASKED_BY.set(_asker(query))
+            try:
+                reply(query, accept)
+            finally:
+                ASKED_BY.reset(asked)
 
         self.zenoh.declare_queryable(key, received, complete=True)
 
@@ -161,7 +179,7 @@ class Node:
 
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
-        self._inbox.append(action)
+        self._inbox.append(partial(copy_context().run, action))
 
     def take_inbox(self) -> bool:
         """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
@@ -258,6 +276,8 @@ class Node:
 
     def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Publish and log an event, with the session's tick if there is one."""
+        by = ASKED_BY.get()
+        text = f"{text} (by {by})" if by and by not in text else text
         event = Event(role=self.role, kind=kind, text=text, session=session, tick=tick)
         log_event(event, self.vehicle)
         self.publish("event", event)

@@ -108,6 +108,20 @@ def stop(
 
 
 @group.command()
+def mark(
+    text: Annotated[str, typer.Argument(help="A line to find the instant by.")],
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Put a line into the log, which `log review` lists."""
+    from aeroloop.protocol.messages.operator import Mark
+
+    with checked(Mark):
+        message = Mark(text=text)
+    _send(config, overrides, "mark", message)
+
+
+@group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle, for another one. It holds until `op arm`."""
     _send(config, overrides, "stand_down")

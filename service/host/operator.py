@@ -22,6 +22,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.host import listener
+from aeroloop.protocol.runtime.node import ASKER_LENGTH
+from aeroloop.protocol.transport.certificate import Certificate
 from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session, refusal
 from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings
 
@@ -74,7 +76,7 @@ def only_vehicle(network: NetworkSettings) -> str | None:
 
 
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Send a request to a vehicle's plant (`arm`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
+    """Send a request to a vehicle's plant (`arm`, `mark`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 
     `arm` also recalls controllers that are holding or faulted. Returns what was done, in one line.
 
@@ -84,7 +86,8 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
     with command_session(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
 
         def ask(topic: str, message: Message) -> list[Answer]:
-            replies = _replies(here.session, topics.key(topic, vehicle), message.encode(), ANSWER_S)
+            key, asker = topics.key(topic, vehicle), _user(here.certificate)
+            replies = _replies(here.session, key, message.encode(), ANSWER_S, asker)
             return [Answer.model_validate_json(content) for _, content in replies]
 
         answers: list[Answer] = []
@@ -93,7 +96,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
             answers = ask(topic, message)
             time.sleep(POLL_S)
         if not answers:
-            role = {"arm": "plant", "inject": "emulator"}.get(topic, "controller")
+            role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
             raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
         done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
         if not done:
@@ -134,10 +137,9 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
             for address in _alive(here.session, vehicle, role="plant"):
                 if address.vehicle not in answers:
                     answers[address.vehicle] = []
-                    payload = Request(by=_user()).encode()
-                    here.session.get(
-                        topics.key("stop", address.vehicle), received, payload=payload, timeout=wait_s, **_ALL
-                    )
+                    key, asker = topics.key("stop", address.vehicle), _user(here.certificate)
+                    payload = Request().encode()
+                    here.session.get(key, received, payload=payload, attachment=asker, timeout=wait_s, **_ALL)
             if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
                 break
             time.sleep(POLL_S)
@@ -156,13 +158,14 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     return Stopped([text for texts in answers.values() for text in texts], failures)
 
 
-def _user() -> str:
-    """This user, for people to read."""
+def _user(certificate: Certificate | None) -> str:
+    """This user and host, and the name in the certificate, for people to read."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container's user without a name
         user = f"uid {os.getuid()}"
-    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:64]
+    name = f"{user}@{socket.gethostname()}" + (f", certificate of {certificate.name}" if certificate else "")
+    return "".join(filter(str.isprintable, name))[:ASKER_LENGTH]
 
 
 _ALL: Final[Any] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
@@ -170,13 +173,13 @@ _ALL: Final[Any] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.Cons
 
 
 def _replies(
-    session: zenoh.Session, key: str, payload: bytes, timeout_s: float
+    session: zenoh.Session, key: str, payload: bytes, timeout_s: float, attachment: str | None = None
 ) -> Iterator[tuple[topics.Address, bytes]]:
-    return _good(session.get(key, payload=payload, timeout=timeout_s, **_ALL))
+    return _good(session.get(key, payload=payload, attachment=attachment, timeout=timeout_s, **_ALL))
 
 
 def _alive(session: zenoh.Session, vehicle: str, **role: str) -> Iterator[topics.Address]:
-    """topics.Addresses of the roles that have declared their liveliness token."""
+    """Addresses of the roles that have declared their liveliness token."""
     for address, _ in _good(session.liveliness().get(topics.key("alive", vehicle, **role), timeout=COMMAND_S)):
         yield address
 

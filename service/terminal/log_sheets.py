@@ -64,8 +64,9 @@ def review_sheets(findings: Findings) -> Sheets:
         yield "", [{"": signs[good], "theorem": text} for good, text in rows.theorem_sentences(findings)]
     others = [*before[-BEFORE_SHOWN:], *(entry for entry in since if not grave(entry[1]))]
     if others:
-        more = max(0, len(before) - BEFORE_SHOWN) + max(0, len(others) - SHOWN)
-        yield "", [_event(*each) for each in others[:SHOWN]]
+        shown = [each for i, each in enumerate(others) if i < SHOWN or each[1].kind == "marked"]
+        more = max(0, len(before) - BEFORE_SHOWN) + len(others) - len(shown)
+        yield "", [_event(*each) for each in shown]
         if more:
             yield f"… and {more} more such events; --json has them all", []
     if findings.checks:

@@ -24,8 +24,11 @@ def role_sheets(statuses: Mapping[str, Status], vehicle: str) -> Sheets:
 
 def status_sheets(found: Gathered) -> Sheets:
     """Every vehicle's roles, as gathered."""
+    recorded = sorted(vehicle for vehicle, statuses in found.statuses.items() if "recorder" in statuses)
     for vehicle, statuses in sorted(found.statuses.items()):
         yield from role_sheets(statuses, vehicle)
+        if recorded and vehicle not in recorded:
+            yield f"the recorder under {', '.join(recorded)} records every vehicle of its network", []
 
 
 def trouble_sheets(found: Gathered, wrong: Sequence[Trouble]) -> Sheets:

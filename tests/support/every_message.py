@@ -59,6 +59,7 @@ MESSAGES: list[operator.Message] = [
     operator.Change(session="5f0c", tick=1234, gains=operator.Gains(), reference=operator.Hold(), within_s=0.1),
     operator.Request(),
     operator.Track(reference=operator.Points(times=[0.0, 1.0], attitudes=[(0.0, 0.0, 0.0)] * 2), within_s=2.5),
+    operator.Mark(text="a bump"),
     operator.Inject(faults=["rate:off@2", "command:drop=0.1"], clear=True),
     operator.Advance(seconds=0.5),
     operator.Answer(done=True, text="armed"),

@@ -63,7 +63,7 @@ class Query:
     """What a queryable is called with; keeps what it is answered."""
 
     def __init__(self, key: str, payload: bytes) -> None:
-        self.key_expr, self.payload = key, _bytes(payload)
+        self.key_expr, self.payload, self.attachment = key, _bytes(payload), None
         self.answers: list[Answer] = []
 
     def reply(self, key: str, payload: bytes) -> None:

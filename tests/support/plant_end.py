@@ -103,19 +103,20 @@ class Asker:
     def session(self) -> str:
         return f"of-a-{self._claims}"
 
-    def query(self, topic: str, payload: bytes = b"") -> bytes:
+    def query(self, topic: str, payload: bytes = b"", by: str | None = None) -> bytes:
         answers: list[bytes] = []
 
         def answered() -> bool:
-            replies = self._session.get(topics.key(topic, "aero", role="plant"), payload=payload, timeout=PATIENCE_S)
+            key = topics.key(topic, "aero", role="plant")
+            replies = self._session.get(key, payload=payload, timeout=PATIENCE_S, attachment=by)
             answers.extend(reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
             return bool(answers)
 
         eventually(f"an answer to {topic}", answered)
         return answers[0]
 
-    def ask(self, topic: str, request: Message | None = None) -> Answer:
-        return Answer.model_validate_json(self.query(topic, (request or Request()).encode()))
+    def ask(self, topic: str, request: Message | None = None, by: str | None = None) -> Answer:
+        return Answer.model_validate_json(self.query(topic, (request or Request()).encode(), by))
 
     def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
         """Claim the plant as controller `a`, each time for another session."""

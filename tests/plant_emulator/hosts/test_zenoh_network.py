@@ -23,7 +23,7 @@ from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Grant, Status
-from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.operator import Answer, Mark
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
@@ -168,7 +168,7 @@ class Plant:
 
     def stop(self) -> Answer:
         """As `aeroloop op stop` does."""
-        return self.asker.ask("stop", Request(by="alice@bench"))
+        return self.asker.ask("stop", by="alice@bench")
 
     def arm(self) -> Answer:
         """As `aeroloop op arm` does."""
@@ -181,6 +181,19 @@ class Plant:
         assert self.grants()
         self._role.enqueue(lambda: self.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
         eventually("the trip", lambda: self.endpoint.trip is not None)
+
+
+def test_a_mark_is_an_event_with_its_tick_and_the_operator_s_name_if_it_can_be_printed(tmp_path: Path) -> None:
+    with Plant(tmp_path) as plant:
+        assert plant.grants(auto_arm=True)
+        eventually("a tick", lambda: plant.endpoint.event_tick is not None)
+        for by in ("alice@bench", "\x1b[2J", "a" * 101, None):
+            assert "no recorder runs" in plant.asker.ask("mark", Mark(text="a bump"), by).text
+        assert plant.arm().done is False  # held
+        eventually("the events", lambda: len([event for event in plant.events if event.kind == "marked"]) == 4)
+        marks = [event for event in plant.events if event.kind == "marked"]
+        assert [mark.text for mark in marks] == ["a bump (by alice@bench)", "a bump", "a bump", "a bump"]
+        assert all(mark.session == plant.asker.session and mark.tick is not None for mark in marks)
 
 
 def test_a_trip_holds_in_the_next_process_until_arm_or_a_claim_with_auto_arm(tmp_path: Path) -> None:

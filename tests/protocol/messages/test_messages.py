@@ -19,6 +19,7 @@ from aeroloop.protocol.messages.operator import (
     Gains,
     Hold,
     Inject,
+    Mark,
     Message,
     MessageError,
     Points,
@@ -113,7 +114,7 @@ def test_a_status_of_another_version_is_read_as_far_as_it_is_known() -> None:
 def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
     for model, payload in (
         (Request, b'{"\\u001b[2J\\n": 0}'),
-        (Request, b'{"by": {"\\u001b[2J\\n": 0}}'),
+        (Mark, b'{"text": {"\\u001b[2J\\n": 0}}'),
         (Track, b'{"reference": {"kind": "\\u001b[2J\\n"}}'),
     ):
         with pytest.raises(MessageError) as refused:
@@ -148,8 +149,8 @@ NUMBER = "Input should be a finite number"
         (Sinusoid, {"amplitude": (0.0, nan, 0.0)}, f"amplitude: {NUMBER}"),
         (Sinusoid, {"frequency": (0.0, inf, 0.0)}, "frequency: Input should be less than or equal to 100"),
         (Track, {"reference": Hold(), "within_s": 0.0}, "within_s: Input should be greater than or equal to 0.02"),
-        (Request, {"by": "a" * 65}, "by: String should have at most 64 characters"),
-        (Request, {"by": "\x1b[2J"}, "by: every character must be printable"),
+        (Mark, {"text": "a" * 201}, "text: String should have at most 200 characters"),
+        (Mark, {"text": "\x1b[2J"}, "text: every character must be printable"),
     ],
 )
 def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
