@@ -17,8 +17,14 @@ from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import report, state
 from aeroloop.service.cli.entry import INTERRUPTED
 
-_EXTRAS: Final = ("can", "cantools", "distributed", "foxglove", "jinja2", "matplotlib", "plotly", "pyarrow", "scipy")
-"""Modules that the core installs without."""
+_EXTRAS: Final = {
+    **dict.fromkeys(("can", "cantools"), "can"),
+    **dict.fromkeys(("jinja2", "matplotlib", "plotly"), "review"),
+    **dict.fromkeys(("pyarrow", "scipy"), "export"),
+    "distributed": "dask",
+    "foxglove": "foxglove",
+}
+"""Modules that the core installs without, and the extra that brings each."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,8 +64,8 @@ def execute(arguments: Sequence[str]) -> int:
         if isinstance(error, AeroloopError | ValueError):
             report(str(error).splitlines()[0])
             return getattr(error, "exit_code", 1)
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _EXTRAS:
-            report(f"this needs {error.name}, which is not installed: pip install 'aeroloop[all]'")
+        if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").partition(".")[0])):
+            report(f"this needs {error.name}, which is not installed: pip install 'aeroloop[{extra}]'")
         else:
             text = f"{type(error).__name__}: {error}".splitlines()[0]
             report(f"unexpected {text}; `aeroloop --debug …` shows where")
