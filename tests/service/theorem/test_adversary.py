@@ -17,6 +17,7 @@ from tests.support import certified
 from tests.support.adversary_loop import Array
 from tests.support.ideal import IDEAL
 
+pytestmark = pytest.mark.realtime  # no clock decides, but its loops take 20 s
 LEAST: Final = 0.1
 """What the adversary reaches of every bound of ‖z‖; of most it reaches 0.2 to 0.9."""
 
