@@ -98,7 +98,12 @@ def test_a_daemon_that_is_terminated_just_as_it_begins_to_wait_ends() -> None:
     [
         ("lab tables", signal.SIGINT, ""),
         ("lab tables", signal.SIGKILL, ""),
-        ("demo --log a.mcap", signal.SIGINT, "aeroloop: 50 s of the experiment in real time, three processes\n"),
+        pytest.param(
+            "demo --log a.mcap",
+            signal.SIGINT,
+            "aeroloop: 50 s of the experiment in real time, three processes\n",
+            marks=pytest.mark.realtime,
+        ),
     ],
 )
 def test_worker_processes_end_with_their_parent_in_silence(

@@ -21,6 +21,7 @@ from tests.support.processes import AEROLOOP
 pytestmark = pytest.mark.processes
 
 
+@pytest.mark.realtime
 def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_reported() -> None:
     """In a process of its own, which becomes real-time. The verdict is this machine's: only its reasons are checked."""
     command = [*AEROLOOP, "host", "doctor", "--json", "--set", "loop.rate_hz=100"]

@@ -286,6 +286,7 @@ def test_a_full_disk_is_reported_and_what_its_cache_holds_no_longer_is_counted_i
     assert running.error is None
 
 
+@pytest.mark.realtime
 def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gathering, record: Record) -> None:
     """A publisher without a cache: what it did not publish cannot be recovered."""
     running = record()
