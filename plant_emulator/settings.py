@@ -150,6 +150,20 @@ class PlantSettings(BaseModel, extra="forbid"):
         wind, sensors = wind_torques(self.wind, mechanism.axes, period), Sensors(self.sensors, period)
         return EmulatedPlant(mechanism, self.rotor, self.friction, wind, sensors, period, limit)
 
+    def continued(self, plant: Plant, before: PlantSettings, period: float) -> EmulatedPlant:
+        """An emulated body with these settings in the state of `plant`, which is of the settings `before`.
+
+        Raises ValueError if anything else is another than before, or the states do not fit each other.
+        """
+        names = type(self).model_fields.keys() - {"aero", "rigid_body", "rotor", "friction", "wind", "sensors"}
+        if other := [name for name in sorted(names) if getattr(self, name) != getattr(before, name)]:
+            raise ValueError(f"plant.{other[0]} holds from a session's start")
+        if not isinstance(plant, EmulatedPlant):
+            raise ValueError(f"plant.kind = {self.kind!r} cannot be changed while it runs: its state is its own")
+        built = self.build(period)
+        built.take_over(plant, wind=self.wind == before.wind, sensors=self.sensors == before.sensors)
+        return built
+
     def endpoint(self, plant: Plant, loop: LoopSettings, wire: WireSpec) -> Endpoint:
         """Make the endpoint of a plant, with the configured faults, limits and watchdog.
 

@@ -23,7 +23,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, Tail, TraceWriter
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.runtime.timing import Clock
 from aeroloop.protocol.transport.link import Arrival
@@ -125,6 +125,13 @@ class PlantReplayed(BaseModel, frozen=True):
     stopped: str | None = Field(description="why it ends before the log does; null if it does not")
 
 
+def cut(batch: Batch, rows: int) -> Batch:
+    """A batch with its first rows only, at least one, and with the changes before the last of them."""
+    columns = {name: column[:rows] for name, column in batch.columns.items()}
+    changes = [change for change in batch.tail.operations if change.tick < int(columns["tick"][-1])]
+    return Batch(batch.header._replace(rows=rows), columns, Tail(operations=changes))
+
+
 def why_not(plant: PlantSettings) -> str | None:
     """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class."""
     if plant.via != "emulator":
@@ -139,12 +146,16 @@ def why_not(plant: PlantSettings) -> str | None:
 
 
 class PlantReplay:
-    """Replays one process of an emulated plant. Raises ValueError with the reason of `why_not`, or PlantError."""
+    """Replays one process of an emulated plant: `endpoint` is as it was after the last row, `last` that row computed.
+
+    Raises ValueError with the reason of `why_not`, or PlantError.
+    """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
         if reason := why_not(plant):
             raise ValueError(reason)
-        self._endpoint = plant.endpoint(plant.make(loop.period), loop, wire)
+        self.endpoint = plant.endpoint(plant.make(loop.period), loop, wire)
+        self.last: PlantRow | None = None
         self._wire = wire
         self._run: int | None = None
         self._rows = self._ticks = self._differ = 0
@@ -196,19 +207,20 @@ class PlantReplay:
         for row in rows:
             tick = int(row["tick"])
             while changes and changes[0].tick < tick:
-                self._change(changes.popleft())
-            if self._endpoint.session != header.session:
+                self.apply(changes.popleft())
+            if self.endpoint.session != header.session:
                 raise AeroloopError(f"tick {tick} is in a session whose claim is missing")
             self._compare(header.session, row)
         for change in changes:
-            self._change(change)
+            self.apply(change)
 
     def _compare(self, session: str, logged: Any) -> None:
         """Compute a tick again, and compare its row."""
         frames = {Sent.FRAME: logged["command"].tobytes(), Sent.SILENT: UNCHANGED, Sent.NONE: None}
         frame = frames.get(logged["received_as"], bytes(self._wire.command.size + 1))
-        measurement = self._endpoint.tick(frame, int(logged["tick"]))
-        row = plant_row(self._endpoint, measurement, None, 0)
+        measurement = self.endpoint.tick(frame, int(logged["tick"]))
+        arrival = None if frame is None else Arrival(frame, 0)
+        self.last = row = plant_row(self.endpoint, measurement, arrival, 0)
         computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]
         self._ticks += 1
         differ = [name for name in _COMPARED if logged[name].tobytes() != computed[name].tobytes()]
@@ -218,9 +230,9 @@ class PlantReplay:
             texts = {"logged": _text(logged[name]), "computed": _text(computed[name])}
             self._first = PlantDifference(tick=tick, session=session, session_tick=session_tick, field=name, **texts)
 
-    def _change(self, change: PlantChange) -> None:
-        """Advance the plant to a change's tick and apply it."""
-        endpoint = self._endpoint
+    def apply(self, change: PlantChange) -> None:
+        """Advance the plant to a change's tick and apply it. Raises AeroloopError where that cannot be."""
+        endpoint = self.endpoint
         if change.cause is TripCause.PLANT:
             return  # it failed within a tick, which has no row, and its process ended
         if change.tick > endpoint.ticked:

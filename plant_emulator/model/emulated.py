@@ -217,6 +217,10 @@ class Sensors:
         """Memory of the filters; see `sensor_function`."""
         return self._held.tolist()  # type: ignore[return-value]  # doubles
 
+    def follow(self, others: Sensors) -> None:
+        """Continue from the filters' memory of other sensors."""
+        self._held[:] = others._held
+
     def _draw(self) -> Iterator[Vector]:
         noise, bias = self._settings.gyro_noise, self._settings.gyro_bias
         while True:
@@ -333,6 +337,21 @@ class EmulatedPlant(Plant):
         self._x[: len(mechanism.initial)] = array("d", mechanism.initial)
         self._true = attitude, rate
         self._measurement = sensors.read(attitude, rate, angles)
+
+    def take_over(self, other: EmulatedPlant, *, wind: bool, sensors: bool) -> None:
+        """Continue from another plant's state; with `wind` and `sensors` also with its gusts and sensors.
+
+        Raises ValueError if the other has another number of states.
+        """
+        if len(self._x) != len(other._x):
+            raise ValueError("another body, or rotors where there were none: a plant cannot continue with that")
+        self._x[:], self._u[:], self._true, self._measurement = other._x, other._u, other._true, other._measurement
+        if wind:
+            self._wind, self._load[:] = other._wind, other._load
+        if sensors:
+            self._sensors = other._sensors
+        else:
+            self._sensors.follow(other._sensors)
 
     def actuate(self, voltages: Sequence[float]) -> None:
         limit = self._limit

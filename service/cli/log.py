@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from aeroloop.service.cli.common import Config, Force, Json, Overrides, fail, load_settings, report, show, working
+from aeroloop.service.cli.common import (
+    Config,
+    Force,
+    Json,
+    NewLog,
+    Overrides,
+    checked,
+    fail,
+    load_settings,
+    report,
+    show,
+    working,
+)
 from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
@@ -24,6 +36,8 @@ Vehicle = Annotated[
 ]
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
 Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
+
+Session = Annotated[str | None, typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.")]
 
 Require = Annotated[
     list[str] | None,
@@ -50,9 +64,7 @@ def review(
     since_s: Since = -inf,
     until_s: Until = inf,
     require: Require = None,
-    session: Annotated[
-        str | None, typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.")
-    ] = None,
+    session: Session = None,
     vehicle: Vehicle = None,
     html: Html = None,
     force: Force = False,
@@ -146,6 +158,66 @@ def replay(
     show(replayed, json, replay_sheets)
     if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)
+
+
+At = Annotated[str, typer.Option("--at", metavar="S|tick:K", help="The instant: a time on the law's clock, or a tick.")]
+
+
+def _instant(text: str) -> int | float:
+    """A tick, or a time on the law's clock [s], as `--at` gives it."""
+    word, number = text.replace(":", " ").split() if text.startswith("tick") else ("", text)
+    try:
+        return int(number) if word else float(number)
+    except ValueError:
+        fail(f"--at is a time such as 12.34, or a tick such as tick:6170, not {text}", 2)
+
+
+@group.command()
+def fork(
+    logs: Logs,
+    at: At,
+    overrides: Overrides = None,
+    gains: Annotated[
+        list[str] | None, typer.Option("--gains", metavar="NAME=A,B,C", help="Gains from that tick on.")
+    ] = None,
+    inject: Annotated[
+        list[str] | None,
+        typer.Option("--inject", metavar="FAULT", help="A fault, as of `op inject`, from that tick on."),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", metavar="S", min=0.01, help="Length; the rest of the log if left out.")
+    ] = None,
+    log: NewLog = None,
+    html: Html = None,
+    session: Session = None,
+    vehicle: Vehicle = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Continue a recorded run from an instant in lockstep, with something changed, beside what was recorded."""
+    from aeroloop.protocol.messages.operator import Gains
+    from aeroloop.service.lab.fork import fork
+    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.review.panels import MAX_POINTS
+    from aeroloop.service.terminal.log_sheets import fork_sheets, fork_tree
+
+    given: dict[str, list[float]] = {}
+    for each in gains or ():
+        name, _, values = each.partition("=")
+        try:
+            given[name] = [float(value) for value in values.strip("[]").split(",")]
+        except ValueError:
+            fail(f"--gains takes NAME=A,B,C, such as C2=0.2,0.2,0.2, not {each}", 2)
+    check_output(html, logs, force=force)
+    with checked(Gains), working("forking", json, 1) as update:
+        forked = fork(
+            logs, _instant(at), session=session, vehicle=vehicle, overrides=overrides or (), faults=inject or (),
+            gains=Gains.model_validate(given) if given else None, duration_s=duration, log=log, progress=update,
+        )  # fmt: skip
+    reports = [one.report(points=MAX_POINTS // 2) for one in (forked.recorded, forked.forked) if one is not None]
+    if html is not None:
+        _write_page(reports, html, logs, force)
+    show(fork_tree(forked, reports), json, lambda _: fork_sheets(forked, reports))
 
 
 @group.command()

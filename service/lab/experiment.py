@@ -23,6 +23,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.figures import Figures, Floats, Integers, figures
+from aeroloop.service.lab.lockstep import LockstepLoop
 from aeroloop.service.lab.loop_function import Course, loop_of
 
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
@@ -162,10 +163,11 @@ def _through_frames(
     measured, commanded, commands = list[list[float]](), list[list[float]](), list[list[float]]()
     silent = [0, 0]  # measurements and commands without a frame
     report_every = loop.ticks(1.0)
-    measurement = endpoint.tick(None, 0)
+    both = LockstepLoop(endpoint, controller, endpoint.tick(None, 0))
     for k in range(loop.ticks(duration_s)):
-        command = controller.tick(measurement, k)
-        if command is None:
+        measurement = both.measurement
+        command = next((one.command for one in both.answer()), None)
+        if measurement is None or command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
             raise LoopEndedError(k * loop.period, trips if controller.fault is None else [controller.fault])
         if controller.tick_index == k:  # it used the measurement
@@ -181,9 +183,9 @@ def _through_frames(
         commanded.append(codes)
         commands.append(voltages)
         silent[1] += command == UNCHANGED
-        if watch is not None and measurement is not None:
+        if watch is not None:
             watch(k, measurement, command)
-        measurement = endpoint.tick(command, k + 1)
+        both.advance(command)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
     rows = ((measured, 6), (commanded, wire.actuators), (commands, wire.actuators), (errors, 3))

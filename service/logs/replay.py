@@ -20,8 +20,9 @@ from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed, why_
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
-from aeroloop.service.config import from_description, load_over
+from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.figures import added, squares
+from aeroloop.service.logs.frames import Direction, differences
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
 from aeroloop.service.logs.ticks import LoggedController, commanded
@@ -34,6 +35,23 @@ class TickDifference(BaseModel, frozen=True):
     time_s: float = Field(description="on the law's clock [s]")
     logged: str = Field(description="the command frame, in hexadecimal; `silent` or `none` where none was sent")
     computed: str
+    signals: list[str] = Field(default=[], description="signals that differ: both values, and how many steps apart")
+
+
+def tick_difference(
+    settings: Settings, direction: Direction, tick: int, logged: tuple[int, np.void], computed: tuple[int, np.void]
+) -> TickDifference:
+    """Two frames of a tick that differ, each with how it was sent (`Sent`, −1 where the row is missing)."""
+    (sent, frame), (other_sent, other_frame) = logged, computed
+    both = sent == other_sent == Sent.FRAME
+    signals = differences(settings.wire, direction, frame.tobytes(), other_frame.tobytes()) if both else []
+    return TickDifference(
+        tick=tick,
+        time_s=round(tick * settings.loop.period, 9),
+        logged=_in_hex(sent, frame),
+        computed=_in_hex(other_sent, other_frame),
+        signals=[*map(str, signals)],
+    )
 
 
 class SessionReplay(BaseModel, frozen=True):
@@ -184,13 +202,9 @@ def _replay_session(
     difference, ticks = None, int(answered.sum())
     if differ.any():
         first = int(np.argmax(differ))
-        tick = int(rows["tick"][first])
-        difference = TickDifference(
-            tick=tick,
-            time_s=round(tick * period, 9),
-            logged=_in_hex(rows["sent_as"][first], rows["command"][first]),
-            computed=_in_hex(computed_as[first], computed[first]),
-        )
+        logged_as = int(rows["sent_as"][first]), rows["command"][first]
+        answer = int(computed_as[first]), computed[first]
+        difference = tick_difference(session.settings, "command", int(rows["tick"][first]), logged_as, answer)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],
@@ -205,8 +219,8 @@ def _replay_session(
     )
 
 
-def _in_hex(sent_as: np.uint8, frame: np.void) -> str:
-    return frame.tobytes().hex() if sent_as == Sent.FRAME else Sent(int(sent_as)).name.lower()
+def _in_hex(sent_as: int, frame: np.void) -> str:
+    return frame.tobytes().hex() if sent_as == Sent.FRAME else "missing" if sent_as < 0 else Sent(sent_as).name.lower()
 
 
 def _replay_plants(

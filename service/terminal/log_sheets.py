@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.report import rows
@@ -15,6 +15,7 @@ from aeroloop.service.terminal.show import Row, Sheets
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
     from aeroloop.service.lab.demo import DemoFigures
+    from aeroloop.service.lab.fork import Fork
     from aeroloop.service.logs.copies import Recovery
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.replay import EndReplay, Replay
@@ -77,11 +78,7 @@ def review_sheets(findings: Findings) -> Sheets:
 def comparison_sheets(reports: Sequence[Report]) -> Sheets:
     """The figures of several runs and the differences between their configurations."""
     names = [report.name for report in reports]
-    figures: list[Row] = []
-    for figure, values, _ in rows.figure_rows([report.findings for report in reports]):
-        texts = [value.text for value in values]
-        figures.append({"": figure.name, **dict(zip(names, texts, strict=True)), " ": figure.unit})
-    yield "", figures
+    yield "", _figure_rows(names, [report.findings for report in reports])
     differing: list[Row] = [
         {"": key, **dict(zip(names, map(rows.shown, values), strict=True))} for key, values in differences(reports)
     ]
@@ -92,6 +89,14 @@ def comparison_sheets(reports: Sequence[Report]) -> Sheets:
         lines += [f"{report.name}: {line}" for line in (*trips, *_some(missing(report.findings)))]
     if lines:
         yield "\n".join(lines), []
+
+
+def _figure_rows(names: Sequence[str], runs: Sequence[Figures]) -> list[Row]:
+    """A row a figure, with a column a run."""
+    return [
+        {"": figure.name, **{name: value.text for name, value in zip(names, values, strict=True)}, " ": figure.unit}
+        for figure, values, _ in rows.figure_rows(runs)
+    ]
 
 
 def _one_run(run: Figures) -> list[Row]:
@@ -219,6 +224,31 @@ def replay_sheets(replay: Replay) -> Sheets:
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
     yield "\n".join(lines), []
+
+
+def fork_tree(fork: Fork, reports: Sequence[Report]) -> dict[str, Any]:
+    """A fork as `--json` prints it."""
+    names = ("tick", "at_s", "changed", "parts", "compared", "ended", "differed", "log")
+    runs = {one.name: one.findings for one in reports}
+    return {**{name: getattr(fork, name) for name in names}, "runs": runs}
+
+
+def fork_sheets(fork: Fork, reports: Sequence[Report]) -> Sheets:
+    """Figures of the fork beside those recorded, where they part, and why the fork ended."""
+    changed = "; ".join(fork.changed) or "nothing is changed"
+    yield f"from tick {fork.tick} ({fork.at_s:g} s): {changed}", []
+    names = ["recorded", "forked"][-len(reports) :]
+    yield "", _figure_rows(names, [report.findings for report in reports])
+    lines = [f"the fork ended: {fork.ended}"] if fork.ended else []
+    lines += [fork.differed] if fork.differed else []
+    if fork.parts is not None:
+        found = fork.parts
+        sent = "; ".join(found.signals) or f"{found.logged} recorded, {found.computed} forked"
+        what = "measured" if found.end == "plant" else "commanded"
+        lines.append(f"they part at tick {found.tick} ({found.time_s:g} s), where the {found.end} {what}: {sent}")
+    elif fork.compared:
+        lines.append(f"{fork.compared} ticks, every one the same, byte for byte")
+    yield "\n".join(lines + ([f"log: {fork.log}"] if fork.log else [])), []
 
 
 def _replayed(replay: Replay, name: End) -> str:
