@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
@@ -170,6 +171,51 @@ def _instant(text: str) -> int | float:
         return int(number) if word else float(number)
     except ValueError:
         fail(f"--at is a time such as 12.34, or a tick such as tick:6170, not {text}", 2)
+
+
+@group.command()
+def step(
+    logs: Logs,
+    at: At,
+    following: Annotated[bool, typer.Option("--next", help="The tick after it.")] = False,
+    previous: Annotated[bool, typer.Option("--previous", help="The tick before it.")] = False,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="CONDITION",
+            help="The first tick after it where a column of the exported table is so, as 'attitude_error_deg > 5', or "
+            "where an event of a kind is: trip, fault, mark, change.",
+        ),
+    ] = None,
+    session: Session = None,
+    vehicle: Vehicle = None,
+    json: Json = False,
+) -> None:
+    """Show all that is known of one tick. In a terminal, keys go on: n, p, u (until), q."""
+    from aeroloop.service.review.instant import Instants
+    from aeroloop.service.terminal.log_sheets import instant_sheets
+
+    with working("reading", json, 1) as update:
+        run = Instants(logs, session, vehicle, update)
+    tick = run.tick_at(_instant(at))
+
+    def found(condition: str) -> int:
+        if (later := run.find(condition, tick)) is None:
+            fail(f"no tick after {tick}, {tick * run.settings.loop.period:g} s: {condition}", 1)
+        return later
+
+    tick = run.tick_at(found(until) if until else tick + following - previous)
+    show(run.at(tick), json, instant_sheets)
+    live = not json and sys.stdin.isatty() and sys.stdout.isatty()
+    while live and (key := typer.getchar()) not in ("q", "\x1b", "\x04"):
+        moved = tick + {"n": 1, "\x1b[C": 1, "p": -1, "\x1b[D": -1}.get(key, 0)
+        if key == "u":
+            moved = found(until or typer.prompt("until"))
+        if run.first <= moved <= run.last and moved != tick:
+            tick = moved
+            typer.clear()
+            show(run.at(tick), json, instant_sheets)
 
 
 @group.command()

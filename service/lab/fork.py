@@ -19,14 +19,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.trace import PlantReplay, cut, plant_row
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description, Event
+from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Gains, in_force
 from aeroloop.protocol.messages.trace import (
     ENDS,
@@ -51,7 +50,7 @@ from aeroloop.service.lab.lockstep import LockstepLoop
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
-from aeroloop.service.logs.session import Session, SessionKey
+from aeroloop.service.logs.session import Session
 from aeroloop.service.logs.ticks import LoggedController, Ticks
 from aeroloop.service.recording.rolling import LogFile
 from aeroloop.service.review.review import Review, read

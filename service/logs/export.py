@@ -1,9 +1,8 @@
 """Export of a log as a table, or as a log with everything decoded.
 
 A table has a row for each tick that a review judges: what the controller received and computed at it (see `Ticks`), and
-the emulator's latest truth. Parquet and CSV have the same columns by the same names, each ending in its unit. Parquet
-has each column's unit and description in its field's metadata, and the configuration in the file's; CSV has a header
-row only, and 1 and 0 for booleans.
+the emulator's latest truth. Parquet has each column's unit and description in its field's metadata, and the
+configuration in the file's; CSV has a header row only, and 1 and 0 for booleans.
 """
 
 from __future__ import annotations
@@ -13,10 +12,8 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from math import inf
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
-import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -24,20 +21,17 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.host import versions
-from aeroloop.service.config import ConfigError, Settings
-from aeroloop.service.control.laws.registry import initial_state, law_of
+from aeroloop.service.config import ConfigError
+from aeroloop.service.logs.columns import Column, columns_of, latest_truth
 from aeroloop.service.logs.copies import write_decoded
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
-from aeroloop.service.logs.session import Array, SessionKey, TrueStates, Unknown
-from aeroloop.service.logs.ticks import Ticks, euler_deg, recompute
+from aeroloop.service.logs.session import SessionKey, TrueStates, Unknown
+from aeroloop.service.logs.ticks import recompute
 
 Format = Literal["parquet", "csv", "mcap"]
 
 AT_A_TIME: Final = 1 << 16  # rows that are turned into columns at a time
-AXES: Final = ("x", "y", "z")
-EULER: Final = ("roll", "pitch", "yaw")
-_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})  # of a unit in a column's name
 
 
 class ExportError(AeroloopError):
@@ -160,112 +154,13 @@ def _pieces(
     recording: Recording, chosen: Sequence[SessionKey], times_s: tuple[float, float], states: TrueStates
 ) -> Iterator[list[Column]]:
     """The columns of some sessions of one vehicle, some rows at a time; a signal of any of them is a column of all."""
-    signals = {which: states.signals(which[1]) for which in chosen}
-    names = sorted({name for its in signals.values() for name in its})
+    names = sorted({name for which in chosen for name in states.signals(which[1])})
     for which in chosen:
-        truth = states.rows(which[1])
-        unknown = np.full(len(truth), np.nan)
-        truth = np.column_stack([truth, *(signals[which].get(name, unknown) for name in names)])
-        truth = np.insert(truth, 0, np.nan, axis=0)
         session = recording.session(which, *times_s)
         ticks = recompute(session).ticks
         for begin in range(0, len(ticks.k), AT_A_TIME):
             some = ticks.where(slice(begin, begin + AT_A_TIME))
-            at = np.searchsorted(truth[1:, 0], some.k, side="right")  # 0: before the first
-            yield columns_of(which, some, truth[at], session.settings, names)
-
-
-# ── columns ──
-
-
-class Column(NamedTuple):
-    """A column and its values, NaN where a double is missing. Shape (n,).
-
-    Its name ends in its unit; the unit is `1` for a number without, empty for what is no quantity.
-    """
-
-    name: str
-    unit: str
-    description: str
-    values: npt.NDArray[Any]
-    boolean: bool = False  # 1.0 and 0.0
-
-
-def columns_of(
-    which: SessionKey, ticks: Ticks, truth: Array, settings: Settings, signals: Sequence[str] = ()
-) -> list[Column]:
-    """Every column of the table of some ticks of a session, with the latest true state at each; NaN before the first.
-
-    A row of `truth` is a tick, q, ω, the motors' voltages and the plant's `signals`: (n, 8 + actuators + signals).
-    """
-    wire, period = settings.wire, settings.loop.period
-    n = len(ticks.k)
-    motors = list(map(str, wire.motors))
-    outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
-    # ε as received is not known where ‖ε‖ > 1: it was scaled to unit length, with η = 0 (Remark 2)
-    received = np.where(ticks.attitude[:, :1] == 0.0, np.nan, ticks.attitude[:, 1:])
-    lengths = np.sqrt(np.sum(np.square(ticks.attitude_error), axis=1))
-    found = [
-        Column("tick", "", "tick k of the law", ticks.k),
-        Column("time_s", "s", "the law's time, k times the period", ticks.k * period),
-        Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", ticks.wall_ns),
-        Column("vehicle", "", "name of the vehicle", np.full(n, which[0], dtype=object)),
-        Column("session", "", "name of the session", np.full(n, which[1], dtype=object)),
-        *_attitude("", "as measured", ticks.attitude),
-        *_attitude("desired_", "as desired", ticks.desired),
-        *_by("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", ticks.rate, AXES),
-        *_by("desired_rate_{}_rad_s", "rad/s", "ω as desired, body frame, about {}", ticks.desired_rate, AXES),
-        *_by("attitude_error_{}", "1", "ε̃ of the attitude as measured, {}", ticks.attitude_error, AXES),
-        *_by("rate_error_{}_rad_s", "rad/s", "ω_e, body frame, about {}", ticks.rate_error, AXES),
-        Column("error_angle_deg", "deg", "angle of the attitude error",
-               np.degrees(2 * np.arcsin(np.minimum(1.0, lengths)))),
-        *_by("voltage_{}_V", "V", "u{} as commanded; none where no command answered", ticks.voltages, motors),
-        Column("latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock",
-               ticks.latency_ns * 1e-3),
-        Column("measurement_delay_us", "µs", "from the plant to the controller, if both ways are equally fast",
-               ticks.measurement_delay_ns * 1e-3),
-        Column("command_delay_us", "µs", "from the controller to the plant, likewise", ticks.command_delay_ns * 1e-3),
-        *_by("saturated_attitude_{}", "", "whether ε has the quantizer's outermost level, {}; unknown where η = 0",
-             _reaches(received, outermost["attitude"]), AXES, True),
-        *_by("saturated_rate_{}", "", "whether ω has the quantizer's outermost level, {}",
-             _reaches(ticks.rate, outermost["rate"]), AXES, True),
-        *_by("saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
-             _reaches(ticks.voltages, outermost["voltage"]), motors, True),
-    ]  # fmt: skip
-    law, since = law_of(settings.law, period, wire.actuators), 0
-    for name, initial in initial_state(law).items():
-        until, unit = since + len(initial), law.units.get(name, "1")
-        # by axis if it is three numbers, else counted
-        axes = {1: [""], 3: [f"_{axis}" for axis in AXES]}.get(len(initial), [f"_{i + 1}" for i in range(len(initial))])
-        suffix = "" if unit == "1" else "_" + unit.translate(_PLAIN)
-        state = ticks.state[:, since:until]
-        found += _by(f"{name}{{}}{suffix}", unit, f"{name} as the law used it, {{}}", state, axes)
-        since = until
-    return [
-        *found,
-        *_by("unquantized_voltage_{}_V", "V", "u{} before quantization", ticks.unquantized, motors),
-        *_attitude("truth_", "as the emulator had it", truth[:, 1:5]),
-        *_by("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", truth[:, 5:8], AXES),
-        *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth[:, 8 : 8 + len(motors)], motors),
-        *_by("plant_{}", "", "{}, the plant's own signal", truth[:, 8 + len(motors) :], signals),
-        Column("truth_age_s", "s", "from the tick of the truth to this one", (ticks.k - truth[:, 0]) * period),
-    ]
-
-
-def _by(name: str, unit: str, what: str, values: Array, axes: Sequence[str], boolean: bool = False) -> Iterator[Column]:
-    """A column per axis, which replaces the braces in its name and description."""
-    for axis, column in zip(axes, values.T, strict=True):
-        yield Column(name.format(axis), unit, what.format(axis), column, boolean)
-
-
-def _attitude(prefix: str, which: str, q: Array) -> Iterator[Column]:
-    for i, part in enumerate(("η", "ε₁", "ε₂", "ε₃")):
-        yield Column(f"{prefix}q{i}", "1", f"{part} {which}", q[:, i])
-    yield from _by(f"{prefix}{{}}_deg", "deg", f"{{}} {which}, by Z–Y–X", euler_deg(q), EULER)
-
-
-def _reaches(values: Array, level: float) -> Array:
-    return np.where(np.isnan(values), np.nan, np.abs(values) >= level)
+            yield columns_of(which, some, latest_truth(states, which[1], names, some.k), session.settings, names)
 
 
 def _array(column: Column) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Final
 
 from aeroloop.service.figures import Figures
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from aeroloop.service.logs.copies import Recovery
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.replay import EndReplay, Replay
+    from aeroloop.service.review.instant import Instant
 
 BEFORE: Final = "before"
 """In place of its time, of what happened before the session."""
@@ -26,6 +28,23 @@ BEFORE_SHOWN: Final = 4
 """Events of no matter from before the session."""
 SHOWN: Final = 12
 """Lines of one kind; `--json` has them all."""
+
+
+VECTORS: Final = {
+    "roll, pitch, yaw [°]": "(roll|pitch|yaw)_deg",
+    "desired [°]": "desired_(roll|pitch|yaw)_deg",
+    "attitude error ε̃ [1]": "attitude_error_[xyz]",
+    "attitude error [°]": "attitude_error_deg",
+    "rate ω [rad/s]": "rate_[xyz]_rad_s",
+    "rate error ω_e [rad/s]": "rate_error_[xyz]_rad_s",
+}
+"""Columns of a table that an instant shows in a row."""
+TRUTHS: Final = {
+    f"{name}_{axis}": f"truth_{truth.format(i=i, axis=axis)}"
+    for name, truth in (("attitude", "q{i}"), ("rate", "rate_{axis}_rad_s"))
+    for i, axis in enumerate("xyz", 1)
+}
+"""The column of the true value of a signal of a measurement."""
 
 
 def figure_sheets(figures: Figures) -> Sheets:
@@ -224,6 +243,50 @@ def replay_sheets(replay: Replay) -> Sheets:
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
     yield "\n".join(lines), []
+
+
+def instant_sheets(its: Instant) -> Sheets:
+    """All that is known of a tick, on one screen."""
+    values = its.values
+    when = its.measured.replace("T", " ").replace("+00:00", " UTC")
+    yield f"tick {its.tick}, {its.time_s:g} s  {when}  session {its.session} of {its.vehicle}", []
+    age_s = values.get("truth_age_s")
+    true = "true" if age_s is None else f"true, {1e3 * age_s:g} ms before"
+    for what, frame in (("measurement", its.measurement), ("command", its.command)):
+        counter = "" if frame.counter is None else f", counter {frame.counter}"
+        received = f"sent as {frame.sent_as}, {frame.received_as.replace('_', ' ')}"
+        shown: list[Row] = []
+        for one in frame.signals:
+            row = {"": one.name, "bits": one.bits, "code": f"{one.code:g}", "level": _digits(one.level)}
+            if what == "command":
+                row["unquantized"] = _digits(values.get(f"unquantized_{one.name}_V"))
+            truth = _digits(values.get(TRUTHS.get(one.name, f"truth_{one.name}_V")))
+            shown.append(row | {true: truth, "unit": one.unit})
+        yield f"{what} {frame.octets or '–'}: {received}{counter}", shown
+    vectors = {
+        what: [value for name, value in values.items() if re.fullmatch(pattern, name)]
+        for what, pattern in VECTORS.items()
+    }
+    after = {f"{name} after": numbers for name, numbers in its.state_after.items()}
+    gains = {f"gain {name}": gain for name, gain in its.gains.items()}
+    used = {name: [v for key, v in values.items() if re.match(f"{name}(_|$)", key)] for name in its.state_after}
+    if values:
+        every = vectors | used | after | its.coordinates | gains
+        columns = [str(i + 1) for i in range(max(map(len, every.values())))]
+        cells = {name: zip_longest(columns, map(_digits, numbers), fillvalue="") for name, numbers in every.items()}
+        yield "", [{"": name, **dict(row)} for name, row in cells.items()]
+    delays = {"measurement": "measurement_delay_us", "command": "command_delay_us", "round trip": "latency_us"}
+    known = [f"{name} {rows.micros(us)}" for name, key in delays.items() if (us := values.get(key)) is not None]
+    clocks = [f"{name} at {'–' if at_s is None else f'{at_s:.6f} s'}" for name, at_s in its.clocks_s.items()]
+    lines = [f"delays: {', '.join(known)}"] * bool(known) + clocks * any(its.clocks_s.values()) + its.notes
+    if lines:
+        yield "\n".join(lines), []
+    if its.events:
+        yield "within a second", [_event(*each) for each in timed(its.events)[:SHOWN]]
+
+
+def _digits(value: float | None) -> str:
+    return "–" if value is None else f"{value:.6g}"
 
 
 def fork_tree(fork: Fork, reports: Sequence[Report]) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def test_the_rows_sum_up_to_the_figures_of_the_review(log: Path, parquet: Table,
         u_total += (row["voltage_2_V"] ** 2 + row["voltage_3_V"] ** 2) * held * period
     assert z_track == pytest.approx(figures.z_track, rel=4e-14)
     assert u_total == pytest.approx(figures.u_total, rel=4e-14)
-    assert max(parquet["error_angle_deg"]) == pytest.approx(figures.max_error_deg, rel=4e-14)
+    assert max(parquet["attitude_error_deg"]) == pytest.approx(figures.max_error_deg, rel=4e-14)
 
 
 def test_a_gap_stays_a_gap_and_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: Settings) -> None:
