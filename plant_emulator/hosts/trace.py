@@ -114,6 +114,7 @@ class PlantDifference(BaseModel, frozen=True):
     field: str = Field(description="column of the row")
     logged: str
     computed: str
+    signals: list[str] = Field(default=[], description="of a measurement: both values, and how many steps apart")
 
 
 class PlantReplayed(BaseModel, frozen=True):

@@ -141,9 +141,6 @@ def _write_page(reports: Sequence[Report], out: Path, logs: Sequence[Path], forc
 @group.command()
 def replay(
     logs: Logs,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override the logged configuration.")
-    ] = None,
     end: Annotated[
         Literal["controller", "plant"] | None, typer.Option("--end", help="Only this end; both if left out.")
     ] = None,
@@ -155,9 +152,37 @@ def replay(
     from aeroloop.service.terminal.log_sheets import replay_sheets
 
     with working("replaying", json, 1) as update:
-        replayed = replay(logs, overrides or [], update, [end] if end else ENDS)
+        replayed = replay(logs, progress=update, ends=[end] if end else ENDS)
     show(replayed, json, replay_sheets)
-    if not overrides and (replayed.differs or not replayed.complete):
+    if replayed.differs or not replayed.complete:
+        raise typer.Exit(1)
+
+
+@group.command()
+def check(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, and folders of logs.")],
+    overrides: Overrides = None,
+    law: Annotated[str | None, typer.Option("--law", metavar="KIND", help="Another law, as of law.kind.")] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Accept what differs: written beside each log, and expected from then on.")
+    ] = False,
+    markdown: Annotated[
+        Path | None, typer.Option("--markdown", metavar="FILE", help="Write the table for a pull request.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Judge a change by logs: compute each again and run its closed loop. Exits with 1 on a difference."""
+    from aeroloop.service.lab.check import check
+    from aeroloop.service.terminal.log_sheets import check_sheets
+    from aeroloop.service.terminal.show import markdown as in_markdown
+
+    words = [*(overrides or ()), *([f"law.kind={law}"] if law else [])]
+    with working("checking", json, 1) as update:
+        checked = check(logs, words, accept=accept, progress=update)
+    show({"same": all(one.same for one in checked), "logs": checked}, json, lambda _: check_sheets(checked), keys=2)
+    if markdown is not None:
+        markdown.write_text(in_markdown(check_sheets(checked)) + "\n", encoding="utf-8")
+    if not all(one.same for one in checked):
         raise typer.Exit(1)
 
 

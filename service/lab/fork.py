@@ -42,7 +42,7 @@ from aeroloop.protocol.transport.history import Delivery
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.laws.registry import law_class, with_gains
+from aeroloop.service.control.laws.registry import gains_of, law_class, with_gains
 from aeroloop.service.control.motion import Approach, shortest
 from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures
@@ -250,8 +250,7 @@ class _Changes:
         given |= gains.named if gains else {}
         replaced: dict[str, None] = {}
         if given:
-            gains = Gains.model_validate(given)
-            with_gains(settings.law, gains)  # raises LawError
+            with_gains(settings.law, Gains.model_validate(given))  # raises LawError
             replaced["gains"] = None
         follows = any(key.startswith("reference") for key in keys)
         if follows:
@@ -259,6 +258,7 @@ class _Changes:
         past = [change for change in recorded.changes if change.tick <= tick]
         future = [change.model_copy(update=replaced) for change in recorded.changes if change.tick > tick]
         if settings.law.kind != before.law.kind:
+            given = gains_of(settings.law).named | given
             past, future = ([each.model_copy(update={"gains": None}) for each in some] for some in (past, future))
 
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
@@ -270,7 +270,7 @@ class _Changes:
             for _ in islice(logged.answers(), int(np.argmax(np.append(later, True)))):
                 pass
             self.controller.restore(logged.controller.state)
-        own = Change(session=self.name, tick=tick, gains=gains if given else None)
+        own = Change(session=self.name, tick=tick, gains=Gains.model_validate(given) if given else None)
         if follows:
             approach = self._approach(settings) if tick else Approach()
             own = own.model_copy(update={"reference": settings.reference, **approach._asdict()})

@@ -3,13 +3,13 @@
 The controller is sans-I/O and its rows hold all its inputs, so a loop over them must give the same commands: which were
 sent, which were silent, and every bit of them. The emulated plant is replayed from its own rows
 (plant_emulator/hosts/trace.py). With another configuration, replay computes what would have been commanded instead;
-the log's plant does not respond to that, so it is no simulation.
+the log's plant does not respond to that, so it is no simulation: service/lab/fork.py is one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from math import sqrt
+from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
@@ -20,12 +20,12 @@ from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed, why_
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
-from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.frames import Direction, differences
-from aeroloop.service.logs.recording import INDEXING, Progress, Recording
+from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
-from aeroloop.service.logs.ticks import LoggedController, commanded
+from aeroloop.service.logs.ticks import LoggedController
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -63,10 +63,7 @@ class SessionReplay(BaseModel, frozen=True):
     ticks: int = Field(description="ticks that were computed again")
     differ: int = Field(description="rows whose command is not the same")
     first_difference: TickDifference | None
-    rms_v: float | None = Field(description="root mean square of the difference between computed and logged levels [V]")
-    max_v: float | None = Field(description="largest difference of a motor [V]")
-    u_total_logged: float = Field(description="∫ uᵀu dt of the commands compared [V²·s]")
-    u_total_computed: float
+    digest: str = Field(description="SHA-256 of the computed commands and of which were silent")
 
 
 class EndReplay(BaseModel, frozen=True):
@@ -96,6 +93,21 @@ class Replay(BaseModel, frozen=True):
     def differs(self) -> bool:
         """Whether any end differs."""
         return any(end is not None and end.differ > 0 for end in (self.controller, self.plant))
+
+    @property
+    def first_differences(self) -> list[str]:
+        """Where each session's controller and each process of the plant first differ, a line each."""
+        lines = list[str]()
+        for session in self.sessions:
+            if (one := session.first_difference) is not None:
+                what = "; ".join(one.signals) or f"{one.logged} and {one.computed}"
+                lines.append(f"{session.session} at tick {one.tick} ({one.time_s:g} s), logged and computed: {what}")
+        for plant in self.plants:
+            if (other := plant.first_difference) is not None:
+                what = "; ".join(other.signals) or f"{other.field} {other.logged} and {other.computed}"
+                where = f"{other.session} at tick {other.session_tick} of the plant"
+                lines.append(f"{where}, logged and computed: {what}")
+        return lines
 
     @property
     def complete(self) -> bool:
@@ -179,7 +191,9 @@ def _replay_session(
     ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
     session = recording.session(which)
     logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
-    rows, wire, period = session.controller, settings.wire, settings.loop.period
+    rows, wire = session.controller, settings.wire
+    if wire.measurement.widths != session.settings.wire.measurement.widths:
+        raise ReviewError("its measurements are frames of another wire, so no command can be computed from them")
     sent_as, frames = bytearray(), bytearray()
 
     def share(done: float) -> None:
@@ -195,11 +209,7 @@ def _replay_session(
         differ = (computed_as != rows["sent_as"]) | (computed != rows["command"])
     else:
         differ = (computed_as != rows["sent_as"]) | (computed_as == Sent.FRAME)
-    answered = computed_as != Sent.NONE
-    before, known = commanded(session, session.settings.wire, rows["sent_as"], rows["command"])
-    after, _ = commanded(session, wire, computed_as, computed)
-    before, after = (np.nan_to_num(volts[known & answered], nan=0.0) for volts in (before, after))
-    difference, ticks = None, int(answered.sum())
+    difference, ticks = None, int((computed_as != Sent.NONE).sum())
     if differ.any():
         first = int(np.argmax(differ))
         logged_as = int(rows["sent_as"][first]), rows["command"][first]
@@ -212,15 +222,22 @@ def _replay_session(
         ticks=ticks,
         differ=int(differ.sum()),
         first_difference=difference,
-        rms_v=sqrt(added(0.0, squares(after - before)) / ticks) if ticks else None,
-        max_v=float(np.abs(after - before).max(initial=0.0)) if ticks else None,
-        u_total_logged=added(0.0, squares(before)) * period,
-        u_total_computed=added(0.0, squares(after)) * period,
+        digest=sha256(sent_as + frames).hexdigest(),
     )
 
 
 def _in_hex(sent_as: int, frame: np.void) -> str:
     return frame.tobytes().hex() if sent_as == Sent.FRAME else "missing" if sent_as < 0 else Sent(sent_as).name.lower()
+
+
+def _with_signals(result: PlantReplayed, wire: WireSpec) -> PlantReplayed:
+    """A result that says which signals of a measurement differ."""
+    first = result.first_difference
+    if first is None or first.field != "measurement" or not (first.logged and first.computed):
+        return result
+    frames = bytes.fromhex(first.logged), bytes.fromhex(first.computed)
+    signals = [*map(str, differences(wire, "measurement", *frames))]
+    return result.model_copy(update={"first_difference": first.model_copy(update={"signals": signals})})
 
 
 def _replay_plants(
@@ -252,7 +269,7 @@ def _replay_plants(
                     done += batch.header.rows
                     if progress is not None:
                         progress((1 + INDEXING) / 2 + (1 - INDEXING) / 2 * done / total)
-                results.append(result := one.result())
+                results.append(result := _with_signals(one.result(), its.wire))
                 left, reason = left - result.ticks, result.stopped
         if reason is not None:
             reasons.append(reason)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.report import rows
 from aeroloop.service.report.rows import count, grave, missing
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, differences
+from aeroloop.service.review.requirements import FIGURES, value_of
 from aeroloop.service.terminal.show import Row, Sheets
 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
+    from aeroloop.service.lab.check import LogCheck
     from aeroloop.service.lab.demo import DemoFigures
     from aeroloop.service.lab.fork import Fork
     from aeroloop.service.logs.copies import Recovery
@@ -225,20 +228,10 @@ def replay_sheets(replay: Replay) -> Sheets:
     for one in replay.sessions:
         row = {"session": f"{one.vehicle}/{one.session}"}
         row |= {"from tick": "–" if one.first_tick is None else str(one.first_tick), "ticks": str(one.ticks)}
-        row |= {"differ": str(one.differ), "rms V": "–" if one.rms_v is None else f"{one.rms_v:.3f}"}
-        row |= {"largest V": "–" if one.max_v is None else f"{one.max_v:.2f}"}
-        sessions.append(row | {"u_total V²·s": f"{one.u_total_logged:.1f} → {one.u_total_computed:.1f}"})
+        sessions.append(row | {"differ": str(one.differ)})
     if sessions:
         yield "", sessions
-    lines = []
-    for session in replay.sessions:
-        if (first := session.first_difference) is not None:
-            where = f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s)"
-            lines.append(f"{where}: {first.logged} logged, {first.computed} computed")
-    for plant in replay.plants:
-        if (other := plant.first_difference) is not None:
-            where = f"plant: first differs at tick {other.session_tick} of {other.session}"
-            lines.append(f"{where}: {other.field} {other.logged} logged, {other.computed} computed")
+    lines = [f"first differs {line}" for line in replay.first_differences]
     lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
@@ -312,6 +305,27 @@ def fork_sheets(fork: Fork, reports: Sequence[Report]) -> Sheets:
     elif fork.compared:
         lines.append(f"{fork.compared} ticks, every one the same, byte for byte")
     yield "\n".join(lines + ([f"log: {fork.log}"] if fork.log else [])), []
+
+
+def check_sheets(checked: Sequence[LogCheck]) -> Sheets:
+    """A row a log, then what could not be compared."""
+    shown = list[Row]()
+    for one in checked:
+        verdict = one.error or (f"{one.differ} of {one.commands} differ" if one.differ else f"{one.commands} equal")
+        verdict = (verdict if one.commands or one.error else "–") + ", accepted" * one.accepted
+        plant = f"{one.plant_differ} of {one.plant_ticks} differ" if one.plant_differ else f"{one.plant_ticks} equal"
+        row = {"": "✓" if one.same else "✗", "log": Path(one.log).name, "commands": verdict}
+        row |= {"plant": plant if one.plant_ticks else "–", "first difference": "; ".join(one.first) or "–"}
+        both = [before_after for before_after in (one.before, one.after) if before_after is not None]
+        for figure in FIGURES:
+            if figure.key in ("z_track", "u_total", "max_error_deg"):
+                values = [value_of(each, figure.path) for each in both]
+                texts = ["–" if value is None else figure.text(value) for value in values]
+                row[f"{figure.key} {figure.unit}"] = " → ".join(texts) if len(both) == 2 else "–"
+        shown.append(row)
+    yield "", shown
+    if notes := [f"{Path(one.log).name}: {line}" for one in checked for line in _some(one.notes)]:
+        yield "\n".join(notes), []
 
 
 def _replayed(replay: Replay, name: End) -> str:

@@ -34,7 +34,7 @@ def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: 
     So many first columns (`keys`) name a row: each block has them where a terminal is too narrow for all columns.
     """
     if form == "markdown":
-        typer.echo("\n".join(_markdown(rows, title)))
+        typer.echo(markdown([(title, rows)]))
     else:
         console = Console()
         if not console.is_terminal:
@@ -48,6 +48,11 @@ def show_all(sheets: Sheets, form: Format = "terminal", keys: int = 1) -> None:
         if i:
             typer.echo("")
         show(rows, title, form, keys)
+
+
+def markdown(sheets: Sheets) -> str:
+    """Tables and paragraphs in Markdown."""
+    return "\n\n".join("\n".join(_markdown(rows, title)) for title, rows in sheets)
 
 
 def drawn(rows: Sequence[Row], title: str, width: int, keys: int = 1) -> Group:

@@ -1,0 +1,134 @@
+"""Check of a change by logs: each is computed again with the code and settings at hand, then its closed loop runs anew.
+
+What the controller commands on the recorded measurements must be the same, byte for byte, unless the difference was
+accepted: then a file beside the log has it. The closed loop runs in lockstep from the session's first tick, with
+everything that came from outside as recorded, and its figures stand beside those of the log.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent import futures
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.engine import local_processes
+from aeroloop.service.lab.fork import fork
+from aeroloop.service.logs.recording import ReviewError
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.recording.rolling import parts
+
+ACCEPTED = ".accepted.json"
+"""Ending of the file beside a log that has its accepted differences."""
+
+
+class LogCheck(BaseModel, frozen=True):
+    """A log, checked."""
+
+    log: str
+    commands: int = Field(default=0, description="commands that were computed again")
+    differ: int = Field(default=0, description="how many of them differ")
+    plant_ticks: int = Field(default=0, description="ticks of the plant that were computed again")
+    plant_differ: int = 0
+    first: list[str] = Field(default=[], description="where each end first differs: tick, signal, both values, steps")
+    digests: list[str] = Field(default=[], description="of the computed commands of each session")
+    accepted: bool = Field(default=False, description="whether these differences were accepted before")
+    notes: list[str] = Field(default=[], description="what could not be compared or run, and why")
+    error: str | None = Field(default=None, description="why it could not be checked at all")
+    before: Figures | None = Field(default=None, description="of the longest session, as recorded")
+    after: Figures | None = Field(default=None, description="of its closed loop, run again")
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing differs that was not accepted."""
+        return self.error is None and (self.accepted or not self.first)
+
+
+def logs_of(paths: Sequence[Path]) -> list[list[Path]]:
+    """The logs of a corpus, each with the files of its run: files, and all in folders. Raises ReviewError if none."""
+    found = list[list[Path]]()
+    for path in paths:
+        if not path.is_dir():
+            found.append([path])
+            continue
+        logs = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
+        rotated = {part for log in logs for part in parts(log)[1:]}
+        found += [parts(log) for log in logs if log not in rotated]
+    if not found:
+        raise ReviewError(f"there is no .mcap file in {', '.join(map(str, paths))}")
+    return found
+
+
+def check(
+    paths: Sequence[Path],
+    overrides: Sequence[str] = (),
+    *,
+    accept: bool = False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> list[LogCheck]:
+    """Check the logs of a corpus with `section.key=value` replaced, on all cores; if `accept`, accept what differs.
+
+    Raises ReviewError if there is no log; one that cannot be read is a result with an error.
+    """
+    logs = logs_of(paths)
+    with local_processes() as workers:
+        running = {workers.executor.submit(check_log, files, tuple(overrides)): i for i, files in enumerate(logs)}
+        results = dict[int, LogCheck]()
+        for done in futures.as_completed(running):
+            results[running[done]] = done.result()
+            progress(len(results) / len(logs))
+    checked = [results[i] for i in range(len(logs))]
+    if accept:
+        for one in checked:
+            if not one.same and one.error is None:
+                _beside(one.log).write_text(json.dumps(_outcome(one), indent=1) + "\n", encoding="utf-8")
+        checked = [one if one.error else one.model_copy(update={"accepted": not one.same}) for one in checked]
+    return checked
+
+
+def check_log(files: Sequence[Path], overrides: Sequence[str]) -> LogCheck:
+    """Check one log, in any process."""
+    name, found, notes = str(files[0]), dict[str, Any](), list[str]()
+    try:
+        done = replay(files, overrides)
+    except AeroloopError as error:
+        if not overrides:
+            return LogCheck(log=name, error=str(error))
+        found["first"] = [str(error)]
+    else:
+        if done.controller is not None:
+            found |= {"commands": done.controller.ticks, "differ": done.controller.differ}
+        if done.plant is not None:
+            found |= {"plant_ticks": done.plant.ticks, "plant_differ": done.plant.differ}
+        found |= {"first": done.first_differences, "digests": [one.digest for one in done.sessions]}
+        notes += [line for lines in done.unseen.values() for line in lines]
+        notes += [f"{end}: {reason}" for end, reason in done.reasons.items() if not overrides]
+    try:
+        again = fork(files, 0, overrides=overrides)
+        found |= {"before": again.recorded and again.recorded.figures, "after": again.figures}
+        notes += [f"the closed loop ended: {again.ended}"] if again.ended else []
+    except AeroloopError as error:
+        notes.append(f"the closed loop was not run: {error}")
+    result = LogCheck(log=name, notes=list(dict.fromkeys(notes)), **found)
+    try:
+        accepted = json.loads(_beside(name).read_text(encoding="utf-8")) == _outcome(result)
+    except (OSError, ValueError):
+        accepted = False
+    return result.model_copy(update={"accepted": accepted})
+
+
+def _beside(log: str) -> Path:
+    path = Path(log)
+    return path.with_name(path.stem + ACCEPTED)
+
+
+def _outcome(one: LogCheck) -> dict[str, Any]:
+    """What is accepted: no figure, whose last digits are the machine's."""
+    return one.model_dump(
+        mode="json", include={"commands", "differ", "plant_ticks", "plant_differ", "first", "digests"}
+    )
