@@ -227,9 +227,11 @@ class PlantReplay:
         differ = [name for name in _COMPARED if logged[name].tobytes() != computed[name].tobytes()]
         self._differ += bool(differ)
         if differ and self._first is None:
-            name, tick, session_tick = differ[0], int(logged["tick"]), int(logged["session_tick"])
-            texts = {"logged": _text(logged[name]), "computed": _text(computed[name])}
-            self._first = PlantDifference(tick=tick, session=session, session_tick=session_tick, field=name, **texts)
+            name = differ[0]
+            self._first = PlantDifference(
+                tick=int(logged["tick"]), session=session, session_tick=int(logged["session_tick"]), field=name,
+                logged=_text(logged[name]), computed=_text(computed[name]),
+            )  # fmt: skip
 
     def apply(self, change: PlantChange) -> None:
         """Advance the plant to a change's tick and apply it. Raises AeroloopError where that cannot be."""

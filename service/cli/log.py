@@ -239,7 +239,7 @@ def step(
             moved = found(until or typer.prompt("until"))
         if run.first <= moved <= run.last and moved != tick:
             tick = moved
-            typer.clear()
+            typer.echo("\x1b[H\x1b[2J", nl=False)
             show(run.at(tick), json, instant_sheets)
 
 
@@ -343,6 +343,14 @@ def export(
     vehicle: Vehicle = None,
     since_s: Since = -inf,
     until_s: Until = inf,
+    around: Annotated[
+        tuple[str, float] | None,
+        typer.Option(
+            "--around",
+            metavar="EVENT S",
+            help="Only S seconds before and after a trip, fault or mark, or words of one.",
+        ),
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -353,7 +361,7 @@ def export(
     _check_part(since_s, until_s)
     with working("exporting", json, 1) as update:
         exported = export(
-            logs, form, out, session=session, vehicle=vehicle, since_s=since_s, until_s=until_s, force=force,
-            progress=update,
+            logs, form, out, session=session, vehicle=vehicle, since_s=since_s, until_s=until_s, around=around,
+            force=force, progress=update,
         )  # fmt: skip
     show(exported, json, export_sheets)

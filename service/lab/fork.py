@@ -47,10 +47,11 @@ from aeroloop.service.control.motion import Approach, shortest
 from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.lockstep import LockstepLoop
+from aeroloop.service.logs.frames import Direction
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
-from aeroloop.service.logs.session import Session
+from aeroloop.service.logs.session import Integers, Session
 from aeroloop.service.logs.ticks import LoggedController, Ticks
 from aeroloop.service.recording.rolling import LogFile
 from aeroloop.service.review.review import Review, read
@@ -63,7 +64,7 @@ class ForkError(AeroloopError):
     """A log cannot be forked so; one line that says why and what to do."""
 
 
-class Parting(TickDifference):
+class Parting(TickDifference, frozen=True):
     """The first tick at which the fork and the recorded run differ; `computed` is the fork's."""
 
     end: End
@@ -113,7 +114,8 @@ def fork(
     Args:
         paths: Logs, folders, or the files of a rotated run.
         at: The tick, as an int, or a time on the law's clock [s].
-        session: As of `Recording.choose`; so is `vehicle`.
+        session: As of `Recording.choose`.
+        vehicle: Likewise.
         overrides: `section.key=value`. From the session's first tick on anything may change; from a later one law,
             reference and, of an emulated body, its mechanics, wind and sensors.
         gains: Gains from that tick on, whatever was recorded later.
@@ -141,7 +143,9 @@ def fork(
     its = _Changes(recorded, settings, tick, overrides, gains)
     if faults:
         plant.endpoint.inject([Fault.parse(text) for text in faults])
-    differed = plant.result().first_difference if tick or settings == recorded.settings else None
+    differed, where = plant.result().first_difference, None
+    if differed is not None:
+        where = f"the plant, computed again, differs from the log from tick {differed.session_tick} on"
     with ExitStack() as stack:
         out = log or Path(stack.enter_context(TemporaryDirectory())) / f"{paths[0].stem or 'log'}-fork.mcap"
         ended = _run(out, recording, recorded, its, plant, later, until, lambda share: report(REPLAYED + 0.3 * share))
@@ -157,7 +161,6 @@ def fork(
         *(f"{name} = {list(gain)}" for name, gain in (gains.named if gains else {}).items()),
         *faults,
     ]
-    where = differed and f"the plant computed again differs from the log from tick {differed.session_tick} on"
     return Fork(tick, tick * period, changed, parts, compared, ended, where, log, forked, known)
 
 
@@ -169,14 +172,15 @@ def _plant_at(
 ) -> tuple[PlantReplay, deque[PlantChange]]:
     """The plant end after its measurement of a tick, and the changes after it that came from outside."""
     vehicle, session = recorded.which
-    for source, description, batches in recording.plants():
-        own = [batch for batch in batches if batch.header.session == session and batch.header.rows]
-        if source.vehicle == vehicle and own:
-            break
-    else:
-        raise ForkError(f"the log has no trace of {vehicle}'s plant in {session}")
-    if description is None:
-        raise ForkError(f"the log has no description of {vehicle}'s plant")
+    processes = [
+        (description, batches)
+        for source, description, batches in recording.plants()
+        if source.vehicle == vehicle
+        if any(batch.header.session == session and batch.header.rows for batch in batches)
+    ]
+    if not processes or (description := processes[0][0]) is None:
+        raise ForkError(f"the log has no trace or no description of {vehicle}'s plant in {session}")
+    batches = processes[0][1]
     was = from_description(description.config)
     another = [
         name for name in ("loop", "wire", "plant") if getattr(settings, name) != getattr(recorded.settings, name)
@@ -419,27 +423,27 @@ def _parting(recorded: Session, forked: Session, first: int) -> tuple[Parting | 
     """The first tick from `first` on at which what an end sent differs, and how many ticks both have."""
     last = min(max(one.extent.last.values()) for one in (recorded, forked))
     found = list[Parting]()
-    for end, name in (("plant", "session_tick"), ("controller", "tick")):
-        sides = []
-        for side in (recorded, forked):
-            rows = side.plant if end == "plant" else side.controller
-            if end == "controller":
-                rows = rows[np.isin(rows["received_as"], (Received.FRAME, Received.SILENT))]
-            rows = rows[(rows[name] >= first) & (rows[name] <= last)]
-            kind, frames = (
-                np.full(last + 1 - first, -1),
-                np.zeros(last + 1 - first, rows.dtype["measurement" if end == "plant" else "command"]),
-            )
-            kind[rows[name] - first] = rows["sent_as"]
-            frames[rows[name] - first] = rows["measurement" if end == "plant" else "command"]
-            sides.append((kind, frames))
-        (kind, frames), (other_kind, other_frames) = sides
+    ends: tuple[tuple[End, Direction], ...] = ("plant", "measurement"), ("controller", "command")
+    for end, direction in ends:
+        (kind, frames), (other_kind, other_frames) = (
+            _sent(one, end, direction, first, last) for one in (recorded, forked)
+        )
         differ = (kind != other_kind) | ((kind == Sent.FRAME) & (frames != other_frames))
         if differ.any():
             i = int(np.argmax(differ))
-            direction = "measurement" if end == "plant" else "command"
-            one = tick_difference(
-                recorded.settings, direction, first + i, (kind[i], frames[i]), (other_kind[i], other_frames[i])
+            sent, other = (int(kind[i]), frames[i]), (int(other_kind[i]), other_frames[i])
+            found.append(
+                Parting(end=end, **dict(tick_difference(recorded.settings, direction, first + i, sent, other)))
             )
-            found.append(Parting(end=end, **dict(one)))
     return min(found, key=lambda one: one.tick, default=None), last + 1 - first
+
+
+def _sent(session: Session, end: End, direction: Direction, first: int, last: int) -> tuple[Integers, Any]:
+    """How and what an end sent at each tick; −1 where its row is missing. Shapes (n,)."""
+    rows, name = (session.plant, "session_tick") if end == "plant" else (session.controller, "tick")
+    if end == "controller":
+        rows = rows[np.isin(rows["received_as"], (Received.FRAME, Received.SILENT))]
+    rows = rows[(rows[name] >= first) & (rows[name] <= last)]
+    kind, frames = np.full(last + 1 - first, -1), np.zeros(last + 1 - first, rows.dtype[direction])
+    kind[rows[name] - first], frames[rows[name] - first] = rows["sent_as"], rows[direction]
+    return kind, frames

@@ -57,9 +57,11 @@ def recover(broken: Path, out: Path, progress: Progress | None = None, *, force:
 
 
 def write_decoded(
-    recording: Recording, out: Path, progress: Progress | None = None
+    recording: Recording, out: Path, progress: Progress | None = None, span_ns: Sequence[int] | None = None
 ) -> tuple[int, list[str], list[str]]:
     """Write a run as one log with every message decoded, which the recorder does at a bounded rate only.
+
+    With a span only messages recorded from its first to its last time [ns since 1970].
 
     Returns how many messages were written, their topics, and what could not be read. Raises OSError.
     """
@@ -68,13 +70,18 @@ def write_decoded(
     decoder = Decoder(rate_hz=None)
     for description in recording.descriptions.values():
         decoder.configure(description)
-    messages, names, _ = _copy(recording.paths, out, "aeroloop log export", progress, decoder)
+    messages, names, _ = _copy(recording.paths, out, "aeroloop log export", progress, decoder, span_ns)
     malformed = [f"malformed: {decoder.malformed} of what is decoded"] if decoder.malformed else []
     return messages, names, [*recording.damaged, *malformed]
 
 
 def _copy(
-    paths: Sequence[Path], out: Path, program: str, progress: Progress | None, decoder: Decoder | None = None
+    paths: Sequence[Path],
+    out: Path,
+    program: str,
+    progress: Progress | None,
+    decoder: Decoder | None = None,
+    span_ns: Sequence[int] | None = None,
 ) -> tuple[int, list[str], list[str]]:
     """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
 
@@ -102,6 +109,8 @@ def _copy(
 
             for record in records(path, damages, report):
                 match record:
+                    case Message(log_time=at) if span_ns and not span_ns[0] <= at <= span_ns[1]:
+                        pass
                     case Message() if record.channel_id in channels:
                         channel, topic = channels[record.channel_id]
                         writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)

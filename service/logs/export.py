@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import chain
 from math import inf
 from pathlib import Path
@@ -20,6 +21,8 @@ import pyarrow.parquet
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.trace import RECORD_S
 from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError
 from aeroloop.service.logs.columns import Column, columns_of, latest_truth
@@ -32,6 +35,9 @@ from aeroloop.service.logs.ticks import recompute
 Format = Literal["parquet", "csv", "mcap"]
 
 AT_A_TIME: Final = 1 << 16  # rows that are turned into columns at a time
+
+
+_BEFORE_NS: Final = round(1.2e9 * RECORD_S)
 
 
 class ExportError(AeroloopError):
@@ -50,6 +56,7 @@ class Exported(BaseModel, frozen=True):
     damages: list[str] = Field(description="what of the log could not be read")
     unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
     left_out: list[str] = Field(default=[], description="other sessions of the log that the table does not have")
+    around: list[str] = Field(default=[], description="events that `around` names; the export is around the first")
 
 
 def export(
@@ -61,16 +68,18 @@ def export(
     vehicle: str | None = None,
     since_s: float = -inf,
     until_s: float = inf,
+    around: tuple[str, float] | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
     """Write a run's ticks as a table, or all of it as a log with everything decoded.
 
     The new file has the first log's name with another ending if `out` is None. Session and vehicle are as of
-    `Recording.choose`, or all sessions of the vehicle; times are the law's.
+    `Recording.choose`, or all sessions of the vehicle; times are the law's. `around` is an event, `trip`, `fault`,
+    `mark` or words of a mark, and how many seconds before and after it are exported.
 
     Raises:
-        ExportError: There is nothing to export.
+        ExportError: There is nothing to export, or no such event.
         OutputError: The file must not be written, or cannot.
         ReviewError: The log cannot be read.
     """
@@ -81,14 +90,26 @@ def export(
     log = paths[0].resolve() if paths[0].is_dir() else paths[0]  # "." has no name
     stem = log.name if log.is_dir() else log.stem
     out = out or log.with_name(stem + ("-decoded.mcap" if to == "mcap" else f".{to}"))
-    chosen: list[SessionKey] = []
+    chosen, events = list[SessionKey](), list[tuple[Event, SessionKey, int]]()
     try:
         with writing(out, paths, force=force) as part:
             recording = Recording(paths, progress)
+            if around is not None:
+                events = _events(recording, around[0], vehicle, tick=to != "mcap")
             if to == "mcap":
-                rows, columns, damages = write_decoded(recording, part, progress)
+                span_ns = None
+                if around is not None:  # from earlier on, so that it has a record of what was in force
+                    at_ns, half_ns = events[0][2], round(around[1] * 1e9)
+                    span_ns = at_ns - half_ns - _BEFORE_NS, at_ns + half_ns
+                rows, columns, damages = write_decoded(recording, part, progress, span_ns)
             else:
                 first = recording.choose(None if session == "all" else session, vehicle)
+                if around is not None:
+                    events = [one for one in events if session is None or one[1] == first]
+                    if not events:
+                        raise ExportError(f"{'/'.join(first)} has no event {around[0]!r}")
+                    first, at_s = events[0][1], (events[0][0].tick or 0) * recording.settings(events[0][1]).loop.period
+                    since_s, until_s = at_s - around[1], at_s + around[1]
                 chosen = recording.sessions_of(first[0]) if session == "all" else [first]
                 rows, columns, damages = _write_table(recording, to, part, chosen, (since_s, until_s))
             size = part.stat().st_size
@@ -104,7 +125,27 @@ def export(
         damages=damages,
         unknown=[one for one in recording.unknown if (one.vehicle, one.session) in chosen],
         left_out=["/".join(which) for which in recording.extents if chosen and which not in chosen],
+        around=[one.text for one, *_ in events],
     )
+
+
+def _events(recording: Recording, what: str, vehicle: str | None, *, tick: bool) -> list[tuple[Event, SessionKey, int]]:
+    """Events that are so named, each with its session and when it was recorded [ns]; with a `tick` if that is wanted.
+
+    Raises ExportError if there is none.
+    """
+    found, kind = list[tuple[Event, SessionKey, int]](), {"trip": "tripped", "mark": "marked"}.get(what, what)
+    for address, message in recording.messages:
+        if address.topic.name == "event" and vehicle in (None, address.vehicle):
+            with suppress(ValueError):  # malformed, which a review counts
+                event = Event.model_validate_json(message.data)
+                which = (address.vehicle, event.session or "")
+                named = event.kind == kind or (event.kind == "marked" and what in event.text)
+                if named and (not tick or (event.tick is not None and which in recording.extents)):
+                    found.append((event, which, message.log_time))
+    if not found:
+        raise ExportError(f"{recording.name} has no event {what!r}: name trip, fault, mark, or words of a mark")
+    return found
 
 
 def _write_table(

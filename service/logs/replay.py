@@ -213,8 +213,8 @@ def _replay_session(
     if differ.any():
         first = int(np.argmax(differ))
         logged_as = int(rows["sent_as"][first]), rows["command"][first]
-        answer = int(computed_as[first]), computed[first]
-        difference = tick_difference(session.settings, "command", int(rows["tick"][first]), logged_as, answer)
+        computed_so = int(computed_as[first]), computed[first]
+        difference = tick_difference(session.settings, "command", int(rows["tick"][first]), logged_as, computed_so)
     return SessionReplay(
         vehicle=which[0],
         session=which[1],

@@ -6,6 +6,7 @@ its time of publication, which the sender's own trace relates to ticks; for one 
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from math import inf, isfinite
@@ -92,7 +93,7 @@ def happened(
     If `alone`, without the trips of other sessions. Marks outside of the `span`, the first and last tick, have no time.
     """
     found: defaultdict[tuple[str, str], list[tuple[float, float, str]]] = defaultdict(list)  # tick, tick shown, text
-    trips, losses = list[str](), Counter[str]()
+    trips, losses, asked = list[str](), Counter[str](), dict[int, str]()  # who asked, by the tick of the change
     (first, last), latest = span, max(session.extent.last.values())
     tick_at, period = _clocks(session), session.settings.loop.period
     for at_ns, role, message in messages.published:
@@ -100,6 +101,8 @@ def happened(
         if isinstance(message, Event):
             of_session = message.session == session.which[1]
             if message.kind == "changed" and role == "controller" and of_session:
+                if message.tick is not None and (by := re.search(r" \(by .*\)$", message.text)):
+                    asked[message.tick] = by.group()
                 continue  # the change itself is in the trace, with its tick
             if message.kind == "tripped" and role == "plant" and (of_session or not alone):
                 trips.append(message.text)
@@ -114,7 +117,8 @@ def happened(
             losses[name] += message.count
             text = f"{message.count} of {name} lost: {LOSS_REASONS[message.reason]}"
             found["recorder", "lost"].append((tick, shown, text))
-    found["controller", "change"] += [(one.tick, one.tick, described(one)) for one in session.changes]
+    changes = ((one.tick, described(one) + asked.get(one.tick, "")) for one in session.changes)
+    found["controller", "change"] += [(tick, tick, text) for tick, text in changes]
     marks = list[tuple[tuple[int, float], Mark]]()
     for (role, kind), placed in found.items():
         kept, rest = placed[:MAX_MARKS], placed[MAX_MARKS:]

@@ -216,6 +216,8 @@ def export_sheets(exported: Exported) -> Sheets:
     else:
         found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
     lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
+    if around := exported.around:
+        lines.append(f"around: {around[0]}" + (f" ({len(around) - 1} more such events)" if len(around) > 1 else ""))
     if others := exported.left_out:
         names = ", ".join(_some(others))
         lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
