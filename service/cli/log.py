@@ -171,18 +171,19 @@ def check(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Judge a change by logs: compute each again and run its closed loop. Exits with 1 on a difference."""
-    from aeroloop.service.lab.check import check
+    """Judge a change by logs. Each is computed again and its closed loop runs again; exits with 1 on a difference."""
+    from aeroloop.service.lab.check import check_logs
     from aeroloop.service.terminal.log_sheets import check_sheets
     from aeroloop.service.terminal.show import markdown as in_markdown
 
     words = [*(overrides or ()), *([f"law.kind={law}"] if law else [])]
     with working("checking", json, 1) as update:
-        checked = check(logs, words, accept=accept, progress=update)
-    show({"same": all(one.same for one in checked), "logs": checked}, json, lambda _: check_sheets(checked), keys=2)
+        results = check_logs(logs, words, accept=accept, progress=update)
+    same = all(one.same for one in results)
+    show({"same": same, "logs": results}, json, lambda _: check_sheets(results), keys=2)
     if markdown is not None:
-        markdown.write_text(in_markdown(check_sheets(checked)) + "\n", encoding="utf-8")
-    if not all(one.same for one in checked):
+        markdown.write_text(in_markdown(check_sheets(results)) + "\n", encoding="utf-8")
+    if not same:
         raise typer.Exit(1)
 
 
@@ -265,7 +266,7 @@ def fork(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Continue a recorded run from an instant in lockstep, with something changed, beside what was recorded."""
+    """Continue a recorded run from an instant, with something changed. In lockstep, beside what was recorded."""
     from aeroloop.protocol.messages.operator import Gains
     from aeroloop.service.lab.fork import fork
     from aeroloop.service.logs.outputs import check_output
@@ -285,7 +286,7 @@ def fork(
             logs, _instant(at), session=session, vehicle=vehicle, overrides=overrides or (), faults=inject or (),
             gains=Gains.model_validate(given) if given else None, duration_s=duration, log=log, progress=update,
         )  # fmt: skip
-    reports = [one.report(points=MAX_POINTS // 2) for one in (forked.recorded, forked.forked) if one is not None]
+    reports = [one.report(points=MAX_POINTS // 2) for one in (forked.recorded, forked.forked)]
     if html is not None:
         _write_page(reports, html, logs, force)
     show(fork_tree(forked, reports), json, lambda _: fork_sheets(forked, reports))

@@ -111,7 +111,7 @@ def examples(
     name: Annotated[str | None, typer.Argument(help="Example to print; all are listed if left out.")] = None,
 ) -> None:
     """List the example configurations and programs, or print one."""
-    files = sorted(file for end in ("*.toml", "*.py") for file in EXAMPLES.glob(end) if file.name != "__init__.py")
+    files = sorted(file for file in EXAMPLES.glob("*.*") if file.suffix != ".pyc" and file.name != "__init__.py")
     texts = {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in files}
     if name is None:
         for file, text in texts.items():

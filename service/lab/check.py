@@ -8,14 +8,15 @@ everything that came from outside as recorded, and its figures stand beside thos
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, Field
 
-from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.errors import AeroloopError, ConfigError
+from aeroloop.service.config import as_overrides
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.engine import local_processes
 from aeroloop.service.lab.fork import fork
@@ -64,18 +65,20 @@ def logs_of(paths: Sequence[Path]) -> list[list[Path]]:
     return found
 
 
-def check(
+def check_logs(
     paths: Sequence[Path],
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str] | Mapping[str, Any] = (),
     *,
     accept: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[LogCheck]:
     """Check the logs of a corpus with `section.key=value` replaced, on all cores; if `accept`, accept what differs.
 
-    Raises ReviewError if there is no log; one that cannot be read is a result with an error.
+    Raises ReviewError if there is no log, ConfigError if an override is wrong; a log that cannot be read is a result
+    with an error.
     """
     logs = logs_of(paths)
+    overrides = as_overrides(overrides) if isinstance(overrides, Mapping) else overrides
     with local_processes() as workers:
         running = {workers.executor.submit(check_log, files, tuple(overrides)): i for i, files in enumerate(logs)}
         results = dict[int, LogCheck]()
@@ -96,6 +99,8 @@ def check_log(files: Sequence[Path], overrides: Sequence[str]) -> LogCheck:
     name, found, notes = str(files[0]), dict[str, Any](), list[str]()
     try:
         done = replay(files, overrides)
+    except ConfigError:
+        raise
     except AeroloopError as error:
         if not overrides:
             return LogCheck(log=name, error=str(error))

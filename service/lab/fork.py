@@ -8,7 +8,6 @@ log, and a real-time one up to the first tick at which the network lost or delay
 
 from __future__ import annotations
 
-import secrets
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -20,40 +19,29 @@ from typing import Any, Final
 
 import numpy as np
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.trace import PlantReplay, cut, plant_row
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Gains, in_force
 from aeroloop.protocol.messages.trace import (
     ENDS,
-    ControllerRow,
     End,
     PlantChange,
-    PlantRow,
     Received,
     Sent,
-    TraceWriter,
-    record_json,
 )
-from aeroloop.protocol.transport.history import Delivery
-from aeroloop.protocol.transport.link import Arrival
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import gains_of, law_class, with_gains
 from aeroloop.service.control.motion import Approach, shortest
 from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures
-from aeroloop.service.lab.lockstep import LockstepLoop
+from aeroloop.service.lab.lockstep import LockstepLog, LockstepLoop
 from aeroloop.service.logs.frames import Direction
-from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
 from aeroloop.service.logs.session import Integers, Session
 from aeroloop.service.logs.ticks import LoggedController, Ticks
-from aeroloop.service.recording.rolling import LogFile
 from aeroloop.service.review.review import Review, read
 
 REPLAYED: Final = 0.6  # share of the progress when both ends have been computed again
@@ -72,18 +60,19 @@ class Parting(TickDifference, frozen=True):
 
 @dataclass(frozen=True)
 class Fork:
-    """A fork, judged as any log is, beside the same span of the recorded run; None where nothing was recorded then."""
+    """A fork, judged as any log is, beside the same span of the recorded run."""
 
     tick: int
     at_s: float
     changed: list[str]  # what is different from the recorded run, a line each
     parts: Parting | None  # None: it repeats the recorded run
     compared: int  # ticks from `tick` on that both have
+    network: int | None  # the first tick at which a command was late or lost that is not in the fork, or the reverse
     ended: str | None  # why it ended before its time
     differed: str | None  # where the plant, computed again, already differed before the fork
     log: Path | None
     forked: Review
-    recorded: Review | None
+    recorded: Review
 
     @property
     def figures(self) -> Figures:
@@ -147,21 +136,18 @@ def fork(
     if differed is not None:
         where = f"the plant, computed again, differs from the log from tick {differed.session_tick} on"
     with ExitStack() as stack:
-        out = log or Path(stack.enter_context(TemporaryDirectory())) / f"{paths[0].stem or 'log'}-fork.mcap"
-        ended = _run(out, recording, recorded, its, plant, later, until, lambda share: report(REPLAYED + 0.3 * share))
-        forked = read(out)
-        found = Recording([out]).session(which)
-        end_s = until * settings.loop.period
-        both = recorded.settings.loop.period == settings.loop.period and recorded.settings.wire == settings.wire
-        parts, compared = _parting(recorded, found, tick) if both else (None, 0)
-        known = read(*paths, session="/".join(which), since_s=tick * period, until_s=end_s + period / 2)
+        out = log or Path(stack.enter_context(TemporaryDirectory())) / "fork.mcap"
+        begun = _begin_log(out, recording, recorded, its)
+        ended = _run(begun, its, plant, later, until, lambda share: report(REPLAYED + 0.3 * share))
+        forked, found = read(out), Recording([out]).session(which)
+        end_s = (until + 0.5) * settings.loop.period
+        known = read(*paths, session="/".join(which), since_s=tick * period, until_s=end_s)
+    same_wire = (recorded.settings.loop, recorded.settings.wire) == (settings.loop, settings.wire)
+    parts, compared, network = _parting(recorded, found, tick) if same_wire else (None, 0, None)
     report(1.0)
-    changed = [
-        *overrides,
-        *(f"{name} = {list(gain)}" for name, gain in (gains.named if gains else {}).items()),
-        *faults,
-    ]
-    return Fork(tick, tick * period, changed, parts, compared, ended, where, log, forked, known)
+    new_gains = [f"{name} = {list(gain)}" for name, gain in (gains.named if gains else {}).items()]
+    changed = [*overrides, *new_gains, *faults]
+    return Fork(tick, tick * period, changed, parts, compared, network, ended, where, log, forked, known)
 
 
 # ── both ends at the instant ──
@@ -261,7 +247,7 @@ class _Changes:
             replaced["reference"] = None
         past = [change for change in recorded.changes if change.tick <= tick]
         future = [change.model_copy(update=replaced) for change in recorded.changes if change.tick > tick]
-        if settings.law.kind != before.law.kind:
+        if another := settings.law.kind != before.law.kind:
             given = gains_of(settings.law).named | given
             past, future = ([each.model_copy(update={"gains": None}) for each in some] for some in (past, future))
 
@@ -274,11 +260,11 @@ class _Changes:
             for _ in islice(logged.answers(), int(np.argmax(np.append(later, True)))):
                 pass
             self.controller.restore(logged.controller.state)
-        own = Change(session=self.name, tick=tick, gains=Gains.model_validate(given) if given else None)
+        own = Change(session=self.name, tick=tick, gains=Gains.model_validate(given) if given or another else None)
         if follows:
             approach = self._approach(settings) if tick else Approach()
             own = own.model_copy(update={"reference": settings.reference, **approach._asdict()})
-        if given or follows:
+        if given or another or follows:
             self.controller.apply(own)
             past = [*past, own]
         self.in_force, self._later = in_force(past), deque(future)
@@ -302,140 +288,68 @@ class _Changes:
 # ── the rest of the run ──
 
 
-class _ForkLog:
-    """The fork's log: rows of both ends, events, true states; on the recorded plant's wall clock."""
-
-    def __init__(self, path: Path, recording: Recording, recorded: Session, its: _Changes) -> None:
-        vehicle, session = recorded.which
-        self._settings, self._tick, self._vehicle, self._name = its.settings, its.tick, vehicle, session
-        place = int(np.searchsorted(recorded.plant["session_tick"], its.tick))
-        row = recorded.plant[min(place, len(recorded.plant) - 1)]
-        self._begin_ns = max(int(row["sent"] + row["wall"]), 1)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = LogFile(path)
-        except FileExistsError:
-            raise OutputError(f"{path} exists already, and logs are never overwritten; name another file") from None
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from None
-        described = recording.described(recorded.which)
-        loop = its.settings.loop.model_copy(update={"lockstep": True})
-        config = its.settings.model_copy(update={"loop": loop}).description()
-        same = config == recorded.settings.description()
-        for end in ENDS:
-            if (one := described.get(end) or next(iter(described.values()), None)) is not None:
-                kept = {"config": config, "role": end} | ({} if same else {"certificate": None})
-                text = one.model_copy(update=kept).encode()
-                self._file.add_description(topics.key("description", vehicle, role=end), text)
-        self._writers = {end: TraceWriter(end, its.settings.wire, secrets.randbits(64)) for end in ENDS}
-        for writer in self._writers.values():
-            writer.session, writer.record = session, record_json(its.in_force)
-        self._writers["controller"].state = its.controller.state.model_dump(mode="json")
-        rate_hz = its.settings.plant.truth_rate_hz
-        self._truth_every = round(its.settings.loop.rate_hz / rate_hz) or 1 if rate_hz else 0
-
-    def _at_ns(self, k: int) -> int:
-        return self._begin_ns + (k - self._tick) * self._settings.loop.period_ns
-
-    def controller(
-        self, k: int, received_as: Received, measurement: bytes, command: bytes | None, its: _Changes
-    ) -> None:
-        """Add a tick of the controller."""
-        self._writers["controller"].changes += its.applied
-        its.applied.clear()
-        sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
-        at_ns = self._at_ns(k)
-        self._row("controller", k, ControllerRow(k, received_as, sent_as, at_ns, at_ns, measurement, command or b""))
-
-    def plant(self, row: PlantRow, endpoint: Endpoint) -> None:
-        """Add a tick of the plant, its events and its true state."""
-        at_ns = self._at_ns(row.session_tick)
-        if endpoint.session is not None:
-            self._row("plant", row.session_tick, row._replace(sent_ns=at_ns, received_ns=at_ns))
-        for notice in endpoint.notices:
-            self.event("plant", notice.kind, notice.text, row.session_tick)
-        endpoint.notices.clear()
-        endpoint.changes.clear()
-        if self._truth_every and row.session_tick % self._truth_every == 0 and (truth := endpoint.truth()) is not None:
-            self._add(topics.key("truth", self._vehicle), truth.encode(), at_ns)
-
-    def event(self, role: str, kind: Any, text: str, k: int) -> None:
-        """Add an event of a role at tick k."""
-        event = Event(role=role, kind=kind, text=text, session=self._name, tick=k)
-        self._add(topics.key("event", self._vehicle, role=role), event.encode(), self._at_ns(k))
-
-    def _row(self, end: End, k: int, row: ControllerRow | PlantRow) -> None:
-        self._writers[end].row(row)
-        if self._writers[end].due(self._at_ns(k)):
-            self._publish(end, k)
-
-    def _publish(self, end: End, k: int, *, final: bool = False) -> None:
-        at_ns = self._at_ns(k)
-        self._add(
-            topics.key("trace", self._vehicle, role=end), self._writers[end].take(at_ns, at_ns, final=final), at_ns
-        )
-
-    def _add(self, key: str, payload: bytes, at_ns: int) -> None:
-        self._file.add(Delivery(key, payload, 0, at_ns, None), at_ns)
-
-    def close(self, k: int) -> None:
-        """Write what is left, and the index."""
-        for end in ENDS:
-            self._publish(end, k, final=True)
-        self._file.commit()
-        self._file.end()
+def _begin_log(path: Path, recording: Recording, recorded: Session, its: _Changes) -> LockstepLog:
+    """The fork's log, which begins at the wall time of its tick on the recorded plant's clock."""
+    place = min(int(np.searchsorted(recorded.plant["session_tick"], its.tick)), len(recorded.plant) - 1)
+    begin_ns = int(recorded.plant["sent"][place] + recorded.plant["wall"][place])
+    described = recording.described(recorded.which)
+    log = LockstepLog(path, its.settings, recorded.which, its.tick, begin_ns)
+    changed = {} if its.settings == recorded.settings else {"certificate": None}
+    for end in ENDS:
+        log.describe((described.get(end) or described["plant"]).model_copy(update={"role": end, **changed}))
+    log.begin(its.controller, its.in_force)
+    return log
 
 
 def _run(
-    out: Path, recording: Recording, recorded: Session, its: _Changes, plant: PlantReplay, later: deque[PlantChange],
-    until: int, report: Progress,
-) -> str | None:  # fmt: skip
-    """Run both ends from the instant up to a tick, and write their log. Returns why it ended before."""
+    log: LockstepLog, its: _Changes, plant: PlantReplay, later: deque[PlantChange], until: int, report: Progress
+) -> str | None:
+    """Run both ends from the instant up to a tick. Returns why it ended before."""
     endpoint, controller, tick = plant.endpoint, its.controller, its.tick
     assert plant.last is not None
-    file = _ForkLog(out, recording, recorded, its)
-    file.plant(plant.last, endpoint)
+    log.plant(plant.last, endpoint)
     loop, ended = LockstepLoop(endpoint, controller, plant.last.measurement, tick - 1, its.before), None
     for k in range(tick, until + 1):
         command: bytes | None = None
         for one in loop.answer():
             command = one.command
-            file.controller(one.k, one.received_as, one.measurement, command, its)
+            log.controller(one, its.applied)
+            its.applied = []
         if controller.fault is not None:
             ended = controller.fault
-            file.event("controller", "fault", ended, k)
+            log.event("controller", "fault", ended, k)
         elif endpoint.session is None:
             ended = endpoint.cause or "the session ended"
         if ended is not None or k == until:
             break
         while later and later[0].tick <= endpoint.ticked:
             plant.apply(later.popleft())
-        loop.advance(command)
-        arrival = None if command is None or (not command and not endpoint.lockstep) else Arrival(command, 0)
-        file.plant(plant_row(endpoint, loop.measurement, arrival, 0), endpoint)
+        arrival = loop.advance(command)
+        log.plant(plant_row(endpoint, loop.measurement, arrival, 0), endpoint)
         if k % 256 == 0:
             report((k - tick) / (until + 1 - tick))
-    file.close(until)
+    log.close(until)
     return ended
 
 
-def _parting(recorded: Session, forked: Session, first: int) -> tuple[Parting | None, int]:
-    """The first tick from `first` on at which what an end sent differs, and how many ticks both have."""
-    last = min(max(one.extent.last.values()) for one in (recorded, forked))
-    found = list[Parting]()
+def _parting(recorded: Session, forked: Session, first: int) -> tuple[Parting | None, int, int | None]:
+    """The first tick from `first` on at which what an end sent differs, and how many ticks both have.
+
+    And the first tick at which the plant acted on another measurement's answer, which in the fork the network decides.
+    """
+    last, found = min(max(one.extent.last.values()) for one in (recorded, forked)), list[Parting]()
     ends: tuple[tuple[End, Direction], ...] = ("plant", "measurement"), ("controller", "command")
     for end, direction in ends:
-        (kind, frames), (other_kind, other_frames) = (
-            _sent(one, end, direction, first, last) for one in (recorded, forked)
-        )
-        differ = (kind != other_kind) | ((kind == Sent.FRAME) & (frames != other_frames))
+        one, other = (_sent(each, end, direction, first, last) for each in (recorded, forked))
+        differ = (one[0] != other[0]) | ((one[0] == Sent.FRAME) & (one[1] != other[1]))
         if differ.any():
             i = int(np.argmax(differ))
-            sent, other = (int(kind[i]), frames[i]), (int(other_kind[i]), other_frames[i])
-            found.append(
-                Parting(end=end, **dict(tick_difference(recorded.settings, direction, first + i, sent, other)))
-            )
-    return min(found, key=lambda one: one.tick, default=None), last + 1 - first
+            sides = (int(one[0][i]), one[1][i]), (int(other[0][i]), other[1][i])
+            found.append(Parting(end=end, **dict(tick_difference(recorded.settings, direction, first + i, *sides))))
+    acted = (one.plant[["session_tick", "answered"]] for one in (recorded, forked))
+    of_one, of_other = (dict(rows[rows["session_tick"] > first].tolist()) for rows in acted)
+    network = next((k for k, answered in of_one.items() if of_other.get(k, answered) != answered), None)
+    return min(found, key=lambda each: each.tick, default=None), last + 1 - first, network
 
 
 def _sent(session: Session, end: End, direction: Direction, first: int, last: int) -> tuple[Integers, Any]:

@@ -286,7 +286,7 @@ def _digits(value: float | None) -> str:
 
 def fork_tree(fork: Fork, reports: Sequence[Report]) -> dict[str, Any]:
     """A fork as `--json` prints it."""
-    names = ("tick", "at_s", "changed", "parts", "compared", "ended", "differed", "log")
+    names = ("tick", "at_s", "changed", "parts", "compared", "network", "ended", "differed", "log")
     runs = {one.name: one.findings for one in reports}
     return {**{name: getattr(fork, name) for name in names}, "runs": runs}
 
@@ -295,8 +295,7 @@ def fork_sheets(fork: Fork, reports: Sequence[Report]) -> Sheets:
     """Figures of the fork beside those recorded, where they part, and why the fork ended."""
     changed = "; ".join(fork.changed) or "nothing is changed"
     yield f"from tick {fork.tick} ({fork.at_s:g} s): {changed}", []
-    names = ["recorded", "forked"][-len(reports) :]
-    yield "", _figure_rows(names, [report.findings for report in reports])
+    yield "", _figure_rows(["recorded", "forked"], [report.findings for report in reports])
     lines = [f"the fork ended: {fork.ended}"] if fork.ended else []
     lines += [fork.differed] if fork.differed else []
     if fork.parts is not None:
@@ -304,6 +303,8 @@ def fork_sheets(fork: Fork, reports: Sequence[Report]) -> Sheets:
         sent = "; ".join(found.signals) or f"{found.logged} recorded, {found.computed} forked"
         what = "measured" if found.end == "plant" else "commanded"
         lines.append(f"they part at tick {found.tick} ({found.time_s:g} s), where the {found.end} {what}: {sent}")
+        if fork.network is not None and fork.network <= found.tick:
+            lines.append(f"a frame was late or lost before, first at tick {fork.network}")
     elif fork.compared:
         lines.append(f"{fork.compared} ticks, every one the same, byte for byte")
     yield "\n".join(lines + ([f"log: {fork.log}"] if fork.log else [])), []

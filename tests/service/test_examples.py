@@ -47,6 +47,20 @@ def test_a_log_is_read_back_into_numpy(tmp_path: Path) -> None:
     assert f"z_track = {read.figures.z_track}, " in printed
 
 
+def test_faults_are_searched_at_the_hardest_instants_of_a_log(tmp_path: Path) -> None:
+    make_log(tmp_path / "run.mcap", 1200)
+    printed = run(tmp_path, str(EXAMPLES / "fork_faults.py"), "run.mcap").splitlines()
+    assert len(printed) == 8  # two seconds, four faults
+    assert all(re.fullmatch(r"tick \d+, [\w.:=@]+: [1-9]\d?\.\d\d° .*", line) for line in printed), printed
+
+
+def test_logs_are_checked_where_the_test_is_copied_to(tmp_path: Path) -> None:
+    (tmp_path / "test_logs.py").write_text((EXAMPLES / "test_logs.py").read_text())
+    (tmp_path / "logs").mkdir()
+    make_log(tmp_path / "logs" / "a.mcap", 200)
+    assert "1 passed" in run(tmp_path, "-m", "pytest", "-q", "test_logs.py")
+
+
 def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
     name = "test_lockstep_hil.py"
     (tmp_path / name).write_text((EXAMPLES / name).read_text())
@@ -54,10 +68,10 @@ def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
 
 
 PUBLIC = """
-    AeroloopError Certificate Controller Figures Hil HilError HysteresisQuantizer LogarithmicQuantizer Measurement Plant
-    RecordedRun Settings SignalSpec State Ticks UniformQuantizer WireSpec
+    AeroloopError Certificate Controller Figures Fork Hil HilError HysteresisQuantizer Instant LogCheck
+    LogarithmicQuantizer Measurement Plant RecordedRun Settings SignalSpec State Ticks UniformQuantizer WireSpec
     ExpressionLaw Gain Gains3 LawSettings Now PositiveGain PythonLaw
-    certify gravity_torque load_settings read_run run_experiment voltages_for
+    certify check_logs gravity_torque load_settings read_run run_experiment voltages_for
 """
 """Names that users write. One that is missing here is added on purpose, and none is ever taken away in passing."""
 

@@ -15,13 +15,15 @@ import pyarrow.parquet
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.models import Event, Truth
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
-from aeroloop.service.logs.export import ExportError, columns_of, export
+from aeroloop.service.logs.columns import columns_of
+from aeroloop.service.logs.export import ExportError, export
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.review.review import read, review
 from aeroloop.service.viewers.channels import Decoder
+from tests.golden.make import HERE as GOLDEN
 from tests.support.edited_log import PERIOD_NS, Said, at_rest, by_mcap, contents, rewrite
 from tests.support.made_log import SESSION, START_NS, VEHICLE, made, make_log, write
 
@@ -93,6 +95,33 @@ def test_a_gap_stays_a_gap_and_truth_is_the_last_that_was_published_by_then(parq
         assert row["truth_age_s"] == pytest.approx((row["tick"] - last) * 0.002)
         if last == row["tick"]:  # the gyro's noise and its quantizer lie between
             assert row["rate_z_rad_s"] == pytest.approx(row["truth_rate_z_rad_s"], abs=quantizer.limit / 20)
+
+
+def test_an_event_is_cut_out_of_a_log_with_the_seconds_beside_it(tmp_path: Path) -> None:
+    log, half = GOLDEN / "default.mcap", 0.25
+    for what, tick in (("fault", 2499), ("trip", 4499)):
+        out = tmp_path / f"{what}.parquet"
+        exported = export([log], "parquet", out, around=(what, half))
+        ticks = pyarrow.parquet.read_table(out).to_pydict()["tick"]
+        assert ticks == [k for k in range(tick - 125, tick + 126) if k < 4500]
+        assert exported.around[0].startswith({"fault": "fault injected", "trip": "stopped by an operator"}[what])
+    with pytest.raises(ExportError, match="has no event 'nothing': name trip, fault, mark, or words of a mark"):
+        export([log], "csv", tmp_path / "a.csv", around=("nothing", 1))
+
+    settings, at = load(), 1500
+    messages = made(settings, 3000)
+    for i, text in enumerate(("gust seen", "another")):
+        event = Event(role="plant", kind="marked", text=text, session=SESSION, tick=at + i)
+        first = next(m for m in messages if m.at_ns >= START_NS + (at + i) * PERIOD_NS)
+        key = topics.key("event", VEHICLE, role="plant")
+        messages.insert(messages.index(first), first._replace(key=key, payload=event.encode()))
+    write(tmp_path / "run.mcap", settings, messages)
+    assert len(export([tmp_path / "run.mcap"], "csv", tmp_path / "b.csv", around=("mark", 1)).around) == 2
+    exported = export([tmp_path / "run.mcap"], "mcap", tmp_path / "cut.mcap", around=("gust", 1))
+    assert exported.around == ["gust seen"]
+    cut = read(tmp_path / "cut.mcap")  # a log that is whole enough to be judged, and has no more than it must
+    assert cut.ticks.k[0] <= at - 500 < at + 450 <= cut.ticks.k[-1] <= at + 500
+    assert cut.ticks.k[0] > 100
 
 
 def test_a_plants_own_signals_reach_the_log_the_table_and_the_page(tmp_path: Path) -> None:

@@ -67,10 +67,13 @@ def test_events_are_shown_once_at_their_sender_s_time_as_of_the_role_in_their_ke
     """The clocks of both ends differ by 10 s; a recorder writes late what it recovers from a cache."""
     chance = random.Random(1)
     said = [one._replace(recorded_ns=START_NS + round(chance.uniform(-10, 70) * 1e9)) for one in HAPPENED]
+    said.append(event(0.1, "controller", "changed", "gains set: C1 (by ann@lab, ann)", tick=0))
     findings = found(rewrite(whole, tmp_path / "a.mcap", more=said))
     marks = [mark for mark in findings.marks if mark.kind != "change"]
     assert [(mark.time_s and round(mark.time_s, 3), mark.role, mark.kind, mark.text) for mark in marks] == SHOWN
     assert findings.trips == ["tilted"]
+    (change,) = (mark.text for mark in findings.marks if mark.kind == "change")
+    assert change.endswith("follows a sinusoid of roll, pitch, yaw 0°, 40°, 100° (by ann@lab, ann)")
 
 
 def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:

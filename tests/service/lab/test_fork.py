@@ -1,0 +1,163 @@
+"""A fork repeats what was recorded where nothing is changed, byte for byte, and else does what the change says."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Gains
+from aeroloop.service.config import load, load_over
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.fork import fork
+from aeroloop.service.logs.recording import Recording
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.session import Session
+from aeroloop.service.logs.ticks import euler_deg
+from aeroloop.service.review.review import read
+from tests.golden.make import HERE as GOLDEN
+from tests.support import own_laws, own_plants
+from tests.support.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+
+TICKS = 600
+PLANT = ["session_tick", "sent_as", "received_as", "outcome", "answered", "measurement", "command"]
+CONTROLLER = ["tick", "received_as", "sent_as", "measurement", "command"]
+
+
+def session(log: Path) -> Session:
+    recording = Recording([log])
+    return recording.session(recording.choose())
+
+
+def assert_repeats(log: Path, out: Path, tick: int) -> None:
+    """All that the rows of both ends have but times, from a tick on."""
+    recorded, forked = session(log), session(out)
+    for end, name, columns in (("plant", "session_tick", PLANT), ("controller", "tick", CONTROLLER)):
+        rows, again = getattr(recorded, end), getattr(forked, end)
+        assert rows[rows[name] >= tick][columns].tolist() == again[columns].tolist()
+        assert len(again)
+
+
+@pytest.mark.parametrize("name", ["default", "on-change"])
+@pytest.mark.parametrize("tick", [0, 1, 1999, 2001, 2600, 4499])  # gains change at 2000, a fault acts from 2499 on
+def test_a_fork_with_no_change_repeats_the_rest_of_a_lockstep_log(tmp_path: Path, name: str, tick: int) -> None:
+    log, out = GOLDEN / f"{name}.mcap", tmp_path / "fork.mcap"
+    found = fork([log], tick, log=out)
+    assert (found.parts, found.differed) == (None, None)
+    assert_repeats(log, out, tick)
+    assert found.figures.z_track == found.recorded.figures.z_track
+    again = replay([out], ends=["controller"])
+    assert (again.differs, again.complete) == (False, True)
+    assert not read(out).findings.missing
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [f"law.kind={own_laws.__name__}:Python"],
+        [f"plant.kind={own_plants.__name__}:Pair"],
+        ["plant.wind.blowing=true", "plant.sensors.rate=gyro", "plant.sensors.gyro_noise=0.01"],
+        ["plant.kind=mujoco", 'plant.own.model="aero"'],
+    ],
+)
+def test_a_fork_repeats_any_law_and_any_plant_that_repeats(tmp_path: Path, overrides: list[str]) -> None:
+    log, out = tmp_path / "run.mcap", tmp_path / "fork.mcap"
+    make_log(log, TICKS, settings=lockstep(*overrides))
+    assert fork([log], 251, log=out).parts is None
+    assert_repeats(log, out, 251)
+
+
+def test_a_real_time_log_is_repeated_up_to_the_tick_that_the_network_decided(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", TICKS, settings=load(), lost={300})
+    found = fork([log], 100)
+    assert found.parts is not None
+    assert (found.parts.tick, found.parts.end, found.parts.logged) == (300, "controller", "missing")
+    assert found.network == 301
+    assert fork([log], 301).parts is None
+
+
+def test_gains_and_a_reference_changed_by_a_fork_are_those_changed_by_an_operator(tmp_path: Path) -> None:
+    without, changed = tmp_path / "without.mcap", tmp_path / "changed.mcap"
+    make_log(without, TICKS)
+    make_log(changed, TICKS, changes={tick: AN_OPERATORS_WORDS[tick] for tick in (120,)})
+    found = fork([without], 120, gains=Gains(C2=(0.2, 0.2, 0.2)), log=tmp_path / "a.mcap")
+    assert_repeats(changed, tmp_path / "a.mcap", 120)
+    assert found.parts is not None
+    fork([changed], 100, gains=Gains(C2=(0.15, 0.15, 0.15)), log=tmp_path / "b.mcap")  # what comes at 120 does not
+    assert_repeats(without, tmp_path / "b.mcap", 100)
+
+    held = fork([without], 200, overrides=["reference.kind=hold", "reference.attitude=[0,5,-10]"], duration_s=8)
+    assert held.figures.duration_s == 8
+    assert euler_deg(held.ticks.attitude[-1:])[0].tolist() == pytest.approx([0, 5, -10], abs=1.5)
+    steps = np.diff(euler_deg(held.ticks.desired), axis=0)
+    assert np.abs(steps).max() < 0.12  # it is approached without a jump, at 1 rad/s at the most
+
+
+def test_a_fault_injected_by_a_fork_is_that_injected_by_an_operator(tmp_path: Path) -> None:
+    without, faulty, fault = tmp_path / "without.mcap", tmp_path / "faulty.mcap", "command:drop=0.3@0..0.4"
+    make_log(without, TICKS)
+    make_log(faulty, TICKS, injected={201: fault})
+    found = fork([without], 200, faults=[fault], log=tmp_path / "fork.mcap")
+    assert found.parts is not None
+    assert_repeats(faulty, tmp_path / "fork.mcap", 200)
+    dead = fork([without], 200, faults=["rate:off"])
+    assert dead.ended == "the sensors have had no valid value for 102 ms: 0 V"
+    assert dead.figures.trips == [dead.ended]
+
+
+@pytest.mark.parametrize(
+    "override", ["law.C1=[0.5,0.5,0.5]", "plant.aero.mass=1.3", "wire.attitude.bits=10", "law.kind=lqr"]
+)
+def test_a_fork_at_the_start_is_an_experiment_with_the_change(tmp_path: Path, override: str) -> None:
+    make_log(log := tmp_path / "run.mcap", TICKS)
+    expected = run_experiment(load_over(lockstep(), [override]), TICKS * 0.002)
+    found = fork([log], 0, overrides=[override]).figures
+    assert (found.z_track, found.u_total) == (expected.z_track, expected.u_total)
+
+
+def test_a_body_changed_in_flight_goes_on_from_the_state_that_it_had(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", TICKS, settings=lockstep("plant.wind.blowing=true"))
+    calm = fork([log], 300, overrides=["plant.wind.blowing=false"], log=tmp_path / "fork.mcap")
+    assert calm.parts is not None
+    assert 300 < calm.parts.tick < 400  # the first measurements are the same
+    heavier = fork([log], 300, overrides=["plant.aero.mass=2.5"])
+    assert calm.parts != heavier.parts
+    assert np.array_equal(calm.ticks.attitude[0], heavier.ticks.attitude[0])
+    settings = load().plant
+    plants = [settings.build(0.002) for _ in range(2)]
+    for plant in plants:
+        for _ in range(100):
+            plant.actuate((10.0, 8.0))
+            plant.advance()
+    plants[1] = settings.continued(plants[1], settings, 0.002)
+    for plant in plants:
+        plant.advance()
+    assert plants[0].truth() == plants[1].truth()
+    assert plants[0].measure() == plants[1].measure()
+
+
+def test_what_cannot_be_forked_is_refused_in_one_line(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", 100)
+    make_log(wheels := tmp_path / "wheels.mcap", 100, settings=lockstep(f"plant.kind={own_plants.__name__}:Pair"))
+    at_50 = partial(fork, [log], 50)
+    for refused, line in (
+        (partial(at_50, overrides=["wire.attitude.bits=10"]), "wire.* holds from the session's start: fork it --at 0"),
+        (partial(at_50, overrides=["plant.limits.max_rate=9"]), "plant.limits holds from a session's start"),
+        (
+            partial(at_50, overrides=["plant.rotor.lag_up_s=0", "plant.rotor.lag_down_s=0"]),
+            "or rotors where there were",
+        ),
+        (partial(fork, [wheels], 50, overrides=["plant.own.inertia=2"]), "plant.own holds from a session's start"),
+        (partial(fork, [log], 100), "the session has ticks 0 to 99, up to 0.198 s, and none 100"),
+        (partial(at_50, gains=Gains(C9=1.0)), "law adaptive has no gain C9; it has C1, C2, Gamma"),
+        (partial(at_50, faults=["foo"]), "it is written signal:kind"),
+        (partial(at_50, log=log), "exists already, and logs are never overwritten"),
+        (partial(fork, [GOLDEN / "can.mcap"], 50), "only an emulated plant is computed again"),
+    ):
+        with pytest.raises(AeroloopError) as error:
+            refused()
+        assert line in str(error.value)
+        assert "\n" not in str(error.value)
