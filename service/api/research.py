@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Gains
 from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, as_overrides, load
@@ -95,7 +94,6 @@ class RecordedRun:
         overrides: Mapping[str, Any] | None = None,
         *,
         faults: Sequence[str] = (),
-        gains: Mapping[str, Sequence[float]] | None = None,
         duration_s: float | None = None,
         log: Path | str | None = None,
     ) -> Fork:
@@ -106,7 +104,6 @@ class RecordedRun:
             overrides: As of `load_settings`. From a tick after the session's first: law, reference, and of an emulated
                 body its mechanics, wind and sensors.
             faults: As of `aeroloop op inject`; their times count from there.
-            gains: Gains by name from there on.
             duration_s: Length [s]; the rest of the run if None.
             log: New file for the fork's ticks.
 
@@ -115,8 +112,7 @@ class RecordedRun:
         """
         return fork(
             self.paths, at, session=self.session, vehicle=self.vehicle, overrides=as_overrides(overrides or {}),
-            gains=Gains.model_validate(dict(gains)) if gains else None, faults=faults, duration_s=duration_s,
-            log=None if log is None else Path(log),
+            faults=faults, duration_s=duration_s, log=None if log is None else Path(log),
         )  # fmt: skip
 
     @cached_property

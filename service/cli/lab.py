@@ -230,33 +230,6 @@ def tune(
     raise typer.Exit(INTERRUPTED if found.interrupted else int(found.worse))
 
 
-def design(
-    error: Annotated[float, typer.Option(min=0, metavar="DEG", help="Attitude error to be proven, in degrees.")],
-    kbit: Annotated[float | None, typer.Option(min=0, help="Largest payload of both frames, in kbit/s.")] = None,
-    rates: Annotated[
-        list[float] | None, typer.Option("--rate", help="Rate, in Hz; may be repeated; as configured if left out.")
-    ] = None,
-    delay: Annotated[float, typer.Option(min=0, metavar="S", help="Further delay of every command, in s.")] = 0.0,
-    loss: Annotated[int, typer.Option(min=0, metavar="N", help="Most frames lost in a row.")] = 0,
-    duration: Duration = PAPER_DURATION_S,
-    engine: EngineOption = "processes",
-    markdown: Markdown = False,
-    json: Json = False,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
-    """Search bits and rate for the least payload. Its attitude error is proven."""
-    settings = load_for_loop(config, overrides)
-    from aeroloop.service.lab import design as lab
-
-    with working("experiments", json) as update:
-        found = lab.design(
-            settings, error_deg=error, kbit=kbit, rates=rates or (), delay_s=delay, lost=loss,
-            duration_s=duration, progress=update, engine=engine,
-        )  # fmt: skip
-    show(found, json, lab.sheets, markdown)
-
-
 group = typer.Typer()
-for verb in (experiment, tables, certify, burden, laws, sweep, tune, design):
+for verb in (experiment, tables, certify, burden, laws, sweep, tune):
     group.command()(verb)

@@ -1,4 +1,4 @@
-"""`aeroloop log`: reviews, compares, replays, recovers and exports logs, and serves a running loop to viewers."""
+"""`aeroloop log`: what is done with logs, and a running loop served to viewers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from aeroloop.service.cli.common import (
     Json,
     NewLog,
     Overrides,
-    checked,
     fail,
     load_settings,
     report,
@@ -169,20 +168,24 @@ def check(
     markdown: Annotated[
         Path | None, typer.Option("--markdown", metavar="FILE", help="Write the table for a pull request.")
     ] = None,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Judge a change by logs. Each is computed again and its closed loop runs again; exits with 1 on a difference."""
     from aeroloop.service.lab.check import check_logs
+    from aeroloop.service.logs.outputs import check_output, writing
     from aeroloop.service.terminal.log_sheets import check_sheets
     from aeroloop.service.terminal.show import markdown as in_markdown
 
     words = [*(overrides or ()), *([f"law.kind={law}"] if law else [])]
+    check_output(markdown, logs, force=force)
     with working("checking", json, 1) as update:
         results = check_logs(logs, words, accept=accept, progress=update)
     same = all(one.same for one in results)
     show({"same": same, "logs": results}, json, lambda _: check_sheets(results), keys=2)
     if markdown is not None:
-        markdown.write_text(in_markdown(check_sheets(results)) + "\n", encoding="utf-8")
+        with writing(markdown, logs, force=force) as part:
+            part.write_text(in_markdown(check_sheets(results)) + "\n", encoding="utf-8")
     if not same:
         raise typer.Exit(1)
 
@@ -250,7 +253,7 @@ def fork(
     at: At,
     overrides: Overrides = None,
     gains: Annotated[
-        list[str] | None, typer.Option("--gains", metavar="NAME=A,B,C", help="Gains from that tick on.")
+        list[str] | None, typer.Option("--gains", metavar="NAME=A,B,C", help="As --set law.NAME=[A,B,C].")
     ] = None,
     inject: Annotated[
         list[str] | None,
@@ -267,24 +270,20 @@ def fork(
     json: Json = False,
 ) -> None:
     """Continue a recorded run from an instant, with something changed. In lockstep, beside what was recorded."""
-    from aeroloop.protocol.messages.operator import Gains
     from aeroloop.service.lab.fork import fork
     from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.review.panels import MAX_POINTS
     from aeroloop.service.terminal.log_sheets import fork_sheets, fork_tree
 
-    given: dict[str, list[float]] = {}
-    for each in gains or ():
-        name, _, values = each.partition("=")
-        try:
-            given[name] = [float(value) for value in values.strip("[]").split(",")]
-        except ValueError:
-            fail(f"--gains takes NAME=A,B,C, such as C2=0.2,0.2,0.2, not {each}", 2)
+    words = [
+        *(overrides or ()),
+        *(f"law.{name}=[{values}]" for name, _, values in (g.partition("=") for g in gains or ())),
+    ]
     check_output(html, logs, force=force)
-    with checked(Gains), working("forking", json, 1) as update:
+    with working("forking", json, 1) as update:
         forked = fork(
-            logs, _instant(at), session=session, vehicle=vehicle, overrides=overrides or (), faults=inject or (),
-            gains=Gains.model_validate(given) if given else None, duration_s=duration, log=log, progress=update,
+            logs, _instant(at), session=session, vehicle=vehicle, overrides=words, faults=inject or (),
+            duration_s=duration, log=log, progress=update,
         )  # fmt: skip
     reports = [one.report(points=MAX_POINTS // 2) for one in (forked.recorded, forked.forked)]
     if html is not None:

@@ -92,7 +92,6 @@ def fork(
     session: str | None = None,
     vehicle: str | None = None,
     overrides: Sequence[str] = (),
-    gains: Gains | None = None,
     faults: Sequence[str] = (),
     duration_s: float | None = None,
     log: Path | None = None,
@@ -106,8 +105,8 @@ def fork(
         session: As of `Recording.choose`.
         vehicle: Likewise.
         overrides: `section.key=value`. From the session's first tick on anything may change; from a later one law,
-            reference and, of an emulated body, its mechanics, wind and sensors.
-        gains: Gains from that tick on, whatever was recorded later.
+            reference and, of an emulated body, its mechanics, wind and sensors. Gains and reference hold whatever was
+            recorded later.
         faults: Faults to inject after that tick's measurement, as `op inject` would.
         duration_s: Length of the fork [s]; to the end of the recorded session if None.
         log: New file for the fork's ticks; None for none.
@@ -129,7 +128,7 @@ def fork(
     settings = load_over(recorded.settings, overrides) if overrides else recorded.settings
     until = last if duration_s is None else tick + max(1, round(duration_s / settings.loop.period)) - 1
     plant, later = _plant_at(recording, recorded, settings, tick, report)
-    its = _Changes(recorded, settings, tick, overrides, gains)
+    its = _Changes(recorded, settings, tick, overrides)
     if faults:
         plant.endpoint.inject([Fault.parse(text) for text in faults])
     differed, where = plant.result().first_difference, None
@@ -145,9 +144,7 @@ def fork(
     same_wire = (recorded.settings.loop, recorded.settings.wire) == (settings.loop, settings.wire)
     parts, compared, network = _parting(recorded, found, tick) if same_wire else (None, 0, None)
     report(1.0)
-    new_gains = [f"{name} = {list(gain)}" for name, gain in (gains.named if gains else {}).items()]
-    changed = [*overrides, *new_gains, *faults]
-    return Fork(tick, tick * period, changed, parts, compared, network, ended, where, log, forked, known)
+    return Fork(tick, tick * period, [*overrides, *faults], parts, compared, network, ended, where, log, forked, known)
 
 
 # ── both ends at the instant ──
@@ -230,14 +227,11 @@ def _plant_anew(batches: Sequence[Any], session: str, settings: Settings) -> Pla
 class _Changes:
     """The controller at an instant, and the changes of gains and reference that it follows from there on."""
 
-    def __init__(
-        self, recorded: Session, settings: Settings, tick: int, overrides: Sequence[str], gains: Gains | None
-    ) -> None:
+    def __init__(self, recorded: Session, settings: Settings, tick: int, overrides: Sequence[str]) -> None:
         self.settings, self.tick, self.name = settings, tick, recorded.which[1]
         law, before = law_class(settings.law), recorded.settings
         keys = [override.partition("=")[0].strip() for override in overrides]
         given = {name: getattr(settings.law, name) for name in law.gains if f"law.{name}" in keys}
-        given |= gains.named if gains else {}
         replaced: dict[str, None] = {}
         if given:
             with_gains(settings.law, Gains.model_validate(given))  # raises LawError

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Gains
 from aeroloop.service.config import load, load_over
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.fork import fork
@@ -83,10 +82,10 @@ def test_gains_and_a_reference_changed_by_a_fork_are_those_changed_by_an_operato
     without, changed = tmp_path / "without.mcap", tmp_path / "changed.mcap"
     make_log(without, TICKS)
     make_log(changed, TICKS, changes={tick: AN_OPERATORS_WORDS[tick] for tick in (120,)})
-    found = fork([without], 120, gains=Gains(C2=(0.2, 0.2, 0.2)), log=tmp_path / "a.mcap")
+    found = fork([without], 120, overrides=["law.C2=[0.2,0.2,0.2]"], log=tmp_path / "a.mcap")
     assert_repeats(changed, tmp_path / "a.mcap", 120)
     assert found.parts is not None
-    fork([changed], 100, gains=Gains(C2=(0.15, 0.15, 0.15)), log=tmp_path / "b.mcap")  # what comes at 120 does not
+    fork([changed], 100, overrides=["law.C2=[0.15,0.15,0.15]"], log=tmp_path / "b.mcap")  # what comes at 120 does not
     assert_repeats(without, tmp_path / "b.mcap", 100)
 
     held = fork([without], 200, overrides=["reference.kind=hold", "reference.attitude=[0,5,-10]"], duration_s=8)
@@ -152,7 +151,7 @@ def test_what_cannot_be_forked_is_refused_in_one_line(tmp_path: Path) -> None:
         ),
         (partial(fork, [wheels], 50, overrides=["plant.own.inertia=2"]), "plant.own holds from a session's start"),
         (partial(fork, [log], 100), "the session has ticks 0 to 99, up to 0.198 s, and none 100"),
-        (partial(at_50, gains=Gains(C9=1.0)), "law adaptive has no gain C9; it has C1, C2, Gamma"),
+        (partial(at_50, overrides=["law.C9=1"]), "unknown key law.C9"),
         (partial(at_50, faults=["foo"]), "it is written signal:kind"),
         (partial(at_50, log=log), "exists already, and logs are never overwritten"),
         (partial(fork, [GOLDEN / "can.mcap"], 50), "only an emulated plant is computed again"),
