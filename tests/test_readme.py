@@ -58,7 +58,7 @@ def test_every_example_configuration_makes_a_loop_that_tracks(path: Path, monkey
 def test_examples_are_listed_and_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert execute(["show", "examples"]) == 0
     listed = capfd.readouterr().out.splitlines()
-    programs = {path.name for path in EXAMPLES.glob("*.py") if path.stem != "__init__"}
+    programs = {path.name for path in EXAMPLES.glob("*.[py]*") if path.stem != "__init__"}
     assert [line.split()[0] for line in listed] == sorted({path.stem for path in EXAMPLES.glob("*.toml")} | programs)
     assert execute(["show", "examples", "paper"]) == 0
     assert capfd.readouterr().out == (EXAMPLES / "paper.toml").read_text(encoding="utf-8")

@@ -225,23 +225,27 @@ def step(
     from aeroloop.service.review.instant import Instants
     from aeroloop.service.terminal.log_sheets import instant_sheets
 
+    instant = _instant(at)
     with working("reading", json, 1) as update:
         run = Instants(logs, session, vehicle, update)
-    tick = run.tick_at(_instant(at))
+    tick = run.tick_at(instant)
 
-    def found(condition: str) -> int:
-        if (later := run.find(condition, tick)) is None:
-            fail(f"no tick after {tick}, {tick * run.settings.loop.period:g} s: {condition}", 1)
-        return later
-
-    tick = run.tick_at(found(until) if until else tick + following - previous)
+    if until is None:
+        tick = run.tick_at(tick + following - previous)
+    elif (later := run.find(until, tick)) is None:
+        fail(f"no tick after {tick}, {tick * run.settings.loop.period:g} s: {until}", 1)
+    else:
+        tick = later
     show(run.at(tick), json, instant_sheets)
     live = not json and sys.stdin.isatty() and sys.stdout.isatty()
     while live and (key := typer.getchar()) not in ("q", "\x1b", "\x04"):
-        moved = tick + {"n": 1, "\x1b[C": 1, "p": -1, "\x1b[D": -1}.get(key, 0)
+        moved: int | None = tick + {"n": 1, "\x1b[C": 1, "p": -1, "\x1b[D": -1}.get(key, 0)
         if key == "u":
-            moved = found(until or typer.prompt("until"))
-        if run.first <= moved <= run.last and moved != tick:
+            until = until or typer.prompt("until")
+            moved = run.find(until, tick)
+        if moved is None or not run.first <= moved <= run.last:
+            report(f"no such tick beside {tick}: there are {run.first} to {run.last}")
+        elif moved != tick:
             tick = moved
             typer.echo("\x1b[H\x1b[2J", nl=False)
             show(run.at(tick), json, instant_sheets)

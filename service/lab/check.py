@@ -21,7 +21,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.lab.engine import local_processes
 from aeroloop.service.lab.fork import fork
 from aeroloop.service.logs.recording import ReviewError
-from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.replay import AnotherWireError, replay
 from aeroloop.service.recording.rolling import parts
 
 ACCEPTED = ".accepted.json"
@@ -99,12 +99,12 @@ def check_log(files: Sequence[Path], overrides: Sequence[str]) -> LogCheck:
     name, found, notes = str(files[0]), dict[str, Any](), list[str]()
     try:
         done = replay(files, overrides)
+    except AnotherWireError as error:
+        found["first"] = [str(error)]
     except ConfigError:
         raise
     except AeroloopError as error:
-        if not overrides:
-            return LogCheck(log=name, error=str(error))
-        found["first"] = [str(error)]
+        return LogCheck(log=name, error=str(error))
     else:
         if done.controller is not None:
             found |= {"commands": done.controller.ticks, "differ": done.controller.differ}

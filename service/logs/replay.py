@@ -28,6 +28,10 @@ from aeroloop.service.logs.session import Missing, SessionKey, Unknown
 from aeroloop.service.logs.ticks import LoggedController
 
 
+class AnotherWireError(ReviewError):
+    """The configuration has a wire whose frames are not those of the log."""
+
+
 class TickDifference(BaseModel, frozen=True):
     """The first row whose computed command differs from the logged one."""
 
@@ -193,7 +197,7 @@ def _replay_session(
     logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
     rows, wire = session.controller, settings.wire
     if wire.measurement.widths != session.settings.wire.measurement.widths:
-        raise ReviewError("its measurements are frames of another wire, so no command can be computed from them")
+        raise AnotherWireError("its measurements are frames of another wire, so no command can be computed from them")
     sent_as, frames = bytearray(), bytearray()
 
     def share(done: float) -> None:

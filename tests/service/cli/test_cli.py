@@ -46,6 +46,7 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("op inject motors:bias=1e308", "bias takes -48 to 48 V, not 1e+308"),
         ("log export a.mcap --format foo", "'foo' is not one of 'parquet', "),
         ("log review a.mcap --from 3 --to 2", "--from 3 is not before --to 2"),
+        ("log step a.mcap --at noon", "--at is a time such as 12.34, or a tick such as tick:6170, not noon"),
         ("log review a.mcap --speed", "see `aeroloop log review --help`"),
         ('demo --set plant.faults=["rate:x"]', "drop, garble, not "),
     ],
