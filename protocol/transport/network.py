@@ -98,6 +98,10 @@ class CommandSession:
         self._endpoints = endpoints
         self._accepting: list[str] | None = None
 
+    def anew(self) -> CommandSession:
+        """The same session, for another command: which endpoints accept connections is found out again."""
+        return CommandSession(self.session, self._endpoints, self.certificate)
+
     def wait_for_links(self, wait_s: float = COMMAND_S) -> None:
         """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
         begun = time.monotonic()
@@ -140,6 +144,15 @@ def command_session(
         raise NetworkError(_no_router(network)) from None
     with closing(session):  # a client is linked from the start
         met = [*network.settings.connect, *meeting] if settings.mode == "peer" else []
+        yield CommandSession(session, met, network.certificate)
+
+
+@contextmanager
+def joined_session(settings: NetworkSettings, identity: Identity = READER) -> Iterator[CommandSession]:
+    """A session as of `join`, for as long as its owner lives, that does not listen and sends commands, too."""
+    network = protected(settings, identity)
+    with closing(join(settings, identity, listen=False)) as session:
+        met = [*network.settings.connect, *network.settings.rendezvous_endpoints] if settings.mode == "peer" else []
         yield CommandSession(session, met, network.certificate)
 
 

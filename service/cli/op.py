@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, report, show
+from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from threading import Event
 
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
     from aeroloop.service.config_sources import Target
@@ -82,6 +84,30 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which restores the terminal, as ^C does
     watch(target.network)
+
+
+@group.command()
+def console(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 8766,
+    address: Annotated[str, typer.Option("--address", help="Address to listen on.")] = "127.0.0.1",
+    tls: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option("--tls", metavar="CERT KEY", help="PEM files of TLS, without which only this host is served."),
+    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Serve a page that shows and operates a running loop. Until ^C; its address has a token."""
+    target, vehicle = _target(config, overrides)
+
+    def run(stop: Event) -> None:
+        from aeroloop.service.console.server import Console
+
+        served = Console(target.network, address, port, tls, vehicle)
+        typer.echo(f"{'a page that only reads' if served.reads_only else 'the console'} is at {served.url}, until ^C")
+        served.run(stop)
+
+    run_alone(run)
 
 
 @group.command()

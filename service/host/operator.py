@@ -84,26 +84,31 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         OperatorError: No role answers, or it refuses.
     """
     with command_session(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
+        return send_by(here, network, vehicle, topic, message)
 
-        def ask(topic: str, message: Message) -> list[Answer]:
-            key, asker = topics.key(topic, vehicle), _user(here.certificate)
-            replies = _replies(here.session, key, message.encode(), ANSWER_S, asker)
-            return [Answer.model_validate_json(content) for _, content in replies]
 
-        answers: list[Answer] = []
-        deadline = time.monotonic() + ANSWER_S
-        while not answers and time.monotonic() < deadline:
-            answers = ask(topic, message)
-            time.sleep(POLL_S)
-        if not answers:
-            role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
-            raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
-        done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
-        if not done:
-            raise OperatorError("; ".join(answer.text for answer in answers))
-        if topic == "arm":
-            done += [answer.text for answer in ask("recall", Request()) if answer.done]
-        return "; ".join(done)
+def send_by(here: CommandSession, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    """As `send`, by a session that is open."""
+
+    def ask(topic: str, message: Message) -> list[Answer]:
+        key, asker = topics.key(topic, vehicle), _user(here.certificate)
+        replies = _replies(here.session, key, message.encode(), ANSWER_S, asker)
+        return [Answer.model_validate_json(content) for _, content in replies]
+
+    answers: list[Answer] = []
+    deadline = time.monotonic() + ANSWER_S
+    while not answers and time.monotonic() < deadline:
+        answers = ask(topic, message)
+        time.sleep(POLL_S)
+    if not answers:
+        role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
+        raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
+    done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
+    if not done:
+        raise OperatorError("; ".join(answer.text for answer in answers))
+    if topic == "arm":
+        done += [answer.text for answer in ask("recall", Request()) if answer.done]
+    return "; ".join(done)
 
 
 class Stopped(NamedTuple):
@@ -123,33 +128,47 @@ def stop(network: NetworkSettings, vehicle: str | None = None) -> Stopped:
 
 
 def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
+    identity = Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
+    with command_session(network, wait_s, identity) as here:
+        return stop_by(here, network, vehicle, wait_s)
+
+
+def stop_by(
+    here: CommandSession, network: NetworkSettings, vehicle: str, wait_s: float = COMMAND_S, known: Iterable[str] = ()
+) -> Stopped:
+    """Stop a vehicle's plant, or every plant (`*`), by a session that is open, waiting so long for their answers.
+
+    Plants that are `known` are asked before any other is looked for.
+    """
     answers: dict[str, list[str]] = {}
 
     def received(reply: zenoh.Reply) -> None:
         for address, content in _good([reply]):
             answers[address.vehicle].append(Answer.model_validate_json(content).text)
 
-    identity = Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
-    with command_session(network, wait_s, identity) as here:
-        begun = time.monotonic()
-        while (passed := time.monotonic() - begun) < wait_s:
-            # A plant declares its token last, so one with a token answers.
-            for address in _alive(here.session, vehicle, role="plant"):
-                if address.vehicle not in answers:
-                    answers[address.vehicle] = []
-                    key, asker = topics.key("stop", address.vehicle), _user(here.certificate)
-                    payload = Request().encode()
-                    here.session.get(key, received, payload=payload, attachment=asker, timeout=wait_s, **_ALL)
-            if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
-                break
-            time.sleep(POLL_S)
-        unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > COMMAND_S)
-        alone = set[str]()
-        if network.mode == "client" and vehicle == "*":  # a router has forgotten a plant that hangs
-            controlled = {
-                each.vehicle for each in _alive(here.session, "*") if (each.role or "").startswith("controller")
-            }
-            alone = controlled - {*answers}
+    def ask(name: str) -> None:
+        if name not in answers:
+            answers[name] = []
+            payload, asker = Request().encode(), _user(here.certificate)
+            here.session.get(
+                topics.key("stop", name), received, payload=payload, attachment=asker, timeout=wait_s, **_ALL
+            )
+
+    for name in known:
+        ask(name)
+    begun = time.monotonic()
+    while (passed := time.monotonic() - begun) < wait_s:
+        # A plant declares its token last, so one with a token answers.
+        for address in _alive(here.session, vehicle, role="plant"):
+            ask(address.vehicle)
+        if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
+            break
+        time.sleep(POLL_S)
+    unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > COMMAND_S)
+    alone = set[str]()
+    if network.mode == "client" and vehicle == "*":  # a router has forgotten a plant that hangs
+        controlled = {each.vehicle for each in _alive(here.session, "*") if (each.role or "").startswith("controller")}
+        alone = controlled - {*answers}
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
     failures += [f"{name} has a controller, and no plant of it answers" for name in sorted(alone)]
     failures += unanswered

@@ -1,24 +1,26 @@
-"""Drawings of the page: panels over time as Plotly's traces and layouts, as JSON with typed arrays.
+"""Drawings of the page: panels over time as Plotly's traces and layouts, as JSON with compressed numbers.
 
 page.js reduces lines to what is in sight. Plotly interprets tags in text, so names and labels are escaped.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
+from base64 import b64encode
 from collections.abc import Iterator, Sequence
 from html import escape
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from aeroloop.service.logs.session import Array
 from aeroloop.service.report.rows import grave
 from aeroloop.service.review.report import Line, Report
 
 # Of runs, in turn: Okabe and Ito's colours, darkened until they can be read on white; dashes for print.
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#b0568c", "#8a6d00", "#5b4bb5", "#3f4a56", "#8b2e16")
 DASHES: Final = ("solid", "7px,2px", "2px,2px", "9px,2px,2px,2px", "14px,3px", "4px,4px")
-INK, QUIET, GRID, BAND, GRAVE, MARK = "#1a1e24", "#58616d", "#eceff2", "#8a6d00", "#b03a00", "#8b95a3"
+QUIET, BAND, GRAVE, MARK = "#58616d", "#8a6d00", "#b03a00", "#8b95a3"
 MEASURED, DESIRED, TRUE = "#0072b2", "#d55e00", "#009e73"
 
 WIDE: Final = 30.0  # durations that differ by more than this factor have a logarithmic axis
@@ -43,20 +45,22 @@ def drawings(reports: Sequence[Report]) -> list[Drawing]:
     return [_drawing(group, reports, shapes, labels) for group in groups]
 
 
-def page_data(reports: Sequence[Report], drawn: Sequence[Drawing]) -> str:
-    """Everything that is drawn, as JSON that may stand in a script element: no text in it can end the script."""
-    from plotly.io.json import to_json_plotly
+def page_data(reports: Sequence[Report], drawn: Sequence[Drawing], *, live: bool = False) -> str:
+    """Everything that is drawn, as JSON that may stand in a script element: no text in it can end the script.
 
-    times, figures = typed([report.time for report in reports]), {drawing.name: drawing.figure for drawing in drawn}
-    data = to_json_plotly({"span": _span(reports), "times": times, "drawings": figures}, engine="json")
-    return str(data).replace("\\u002f", "/")  # which numbers are full of; without a `<` it ends nothing
-
-
-def typed(lines: Sequence[Array]) -> list[Any]:
-    """Numbers as Plotly's typed arrays."""
-    from plotly.graph_objects import Figure, Scatter
-
-    return [trace["y"] for trace in Figure([Scatter(y=values) for values in lines]).to_dict()["data"]]
+    `numbers` are times, then lines, one after the other as little-endian doubles and floats, compressed by gzip: levels
+    of quantizers take a tenth.
+    """
+    figures = {drawing.name: drawing.figure for drawing in drawn}
+    times = [report.time.astype("<f8") for report in reports]
+    lines = [trace.pop("y") for figure in figures.values() for trace in figure["data"]]
+    octets = gzip.compress(b"".join(each.tobytes() for each in (*times, *lines)), 6, mtime=0)
+    period = max((report.period_s or 0.0 for report in reports), default=0.0)
+    data = {
+        "span": span_of(reports), "drawings": figures, "period": period, "live": live,
+        "numbers": b64encode(octets).decode(), "times": [len(each) for each in times],
+    }  # fmt: skip
+    return json.dumps(data).replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: list[Json]) -> Drawing:
@@ -64,15 +68,15 @@ def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: 
     found = [(run, panel) for run, report in enumerate(reports) for panel in report.panels if panel.group == group]
     rows = {label: i for i, label in enumerate(dict.fromkeys(panel.label for _, panel in found))}
     axes = ["y", *(f"y{row}" for row in range(2, len(rows) + 1))]
-    layout: Json = {
-        "paper_bgcolor": "#fff", "plot_bgcolor": "#fff", "font": {"size": 12, "color": QUIET},
+    layout: Json = {  # the page's style sheet has the colours of paper, text and grid
+        "font": {"size": 12},
         "margin": {"l": 78, "r": 10, "t": 24, "b": 36},
         "legend": {"orientation": "h", "x": 1, "xanchor": "right", "y": 1, "yanchor": "bottom", "uirevision": "kept"},
         "hovermode": "x unified", "hoversubplots": "axis", "hoverlabel": {"namelength": -1},
         "grid": {"rows": len(rows), "columns": 1, "ygap": 0.12, "subplots": [[f"x{axis}"] for axis in axes]},
         "xaxis": {
             "title": {"text": "time [s]", "standoff": 4}, "anchor": axes[-1], "zeroline": False,
-            "gridcolor": GRID, "hoverformat": ".3f", "unifiedhovertitle": {"text": "%{x:.3f} s"},
+            "hoverformat": ".3f", "unifiedhovertitle": {"text": "%{x:.3f} s"},
         },
         "shapes": shapes, "annotations": labels,
     }  # fmt: skip
@@ -80,23 +84,22 @@ def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: 
         unit = next(panel.unit for _, panel in found if panel.label == label)
         drawn = np.concatenate([line.values for _, panel in found if panel.label == label for line in panel.lines])
         text = _plain(label) + ("" if unit == "1" else f"<br>[{_plain(unit)}]")
-        is_wide = unit == "ms" and np.nanmin(drawn) > 0 and np.nanmax(drawn) > WIDE * np.nanmin(drawn)
+        is_wide = unit == "ms" and len(drawn) and np.nanmin(drawn) > 0 and np.nanmax(drawn) > WIDE * np.nanmin(drawn)
         layout[axes[row].replace("y", "yaxis")] = {
-            "title": {"text": text, "standoff": 4, "font": {"color": INK}}, "gridcolor": GRID, "fixedrange": True,
-            "zerolinecolor": "#d9dde3", "nticks": 5, "exponentformat": "power",
+            "title": {"text": text, "standoff": 4}, "fixedrange": True, "nticks": 5, "exponentformat": "power",
             "rangemode": "tozero" if unit == "ms" else "normal", "type": "log" if is_wide else "linear",
         }  # fmt: skip
-    traces, values, known = list[Json](), list[Array](), set[str]()
+    traces, known = list[Json](), set[str]()
     for desired in (True, False):  # which lie below the others
         for run, panel in found:
             for line in panel.lines:
                 if line.desired == desired:
                     entry, stroke = _stroke(line, run, reports)
                     name = " ".join([panel.label] * (len(rows) > 1) + [entry] * (len(reports) > 1) + [line.label])
-                    values.append(line.values.astype(np.float32))
                     stroke["shape"] = "hv" if line.held and reports[run].thinned <= 2 else "linear"
                     traces.append({
                         "type": "scatter", "mode": "lines", "times": run, "yaxis": axes[rows[panel.label]],
+                        "y": line.values.astype("<f4"), "panel": panel.label, "quantity": line.label, "unit": panel.unit.removeprefix("1"),
                         "line": stroke, "name": _plain(entry), "legendgroup": entry, "showlegend": entry not in known,
                         "hovertemplate": _plain(f"{name}: %{{y:.4~g}} {panel.unit.strip('1')}") + "<extra></extra>",
                         # A line that is published less often than every tick has no gaps between its values.
@@ -107,8 +110,7 @@ def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: 
     title = " / ".join(dict.fromkeys(panel.title for _, panel in found))
     is_timing = any(panel.unit == "ms" for _, panel in found)
     section = "timing" if is_timing else group if group == "theorem" else "tracking"
-    data = [trace | {"y": y} for trace, y in zip(traces, typed(values), strict=True)]
-    return Drawing(group, title, section, len(rows), {"data": data, "layout": layout})
+    return Drawing(group, title, section, len(rows), {"data": traces, "layout": layout})
 
 
 def _stroke(line: Line, run: int, reports: Sequence[Report]) -> tuple[str, Json]:
@@ -125,7 +127,7 @@ def _stroke(line: Line, run: int, reports: Sequence[Report]) -> tuple[str, Json]
     return entry, {"color": colour, "width": width, "dash": dash}
 
 
-def _span(reports: Sequence[Report]) -> tuple[float, float]:
+def span_of(reports: Sequence[Report]) -> tuple[float, float]:
     """Time span of the page [s], with a margin, so that events at its ends are visible."""
     times = [float(time) for report in reports for time in (*report.time[:1], *report.time[-1:])]
     if not any(report.part for report in reports):
@@ -157,7 +159,7 @@ def _fault_labels(reports: Sequence[Report]) -> list[Json]:
     """Names of the faults, where they begin, in three rows at the top of the first panel."""
     alike = {
         "xanchor": "left", "y": 1, "yref": "paper", "yanchor": "top", "showarrow": False, "borderpad": 0,
-        "font": {"size": 11, "color": INK},
+        "font": {"size": 11},
     }  # fmt: skip
     found = [(start, label) for report in reports for start, _, label in _faults(report)]
     return [alike | {"text": _plain(label), "x": x, "yshift": -12 * (i % 3)} for i, (x, label) in enumerate(found)]

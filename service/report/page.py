@@ -17,38 +17,48 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from aeroloop.service.report import rows
-from aeroloop.service.report.drawings import COLOURS, drawings, page_data
+from aeroloop.service.report.drawings import COLOURS, drawings, page_data, span_of
 from aeroloop.service.review.report import Findings, Report, differences, flat
 from aeroloop.service.review.requirements import percent, seconds
 
 Json = dict[str, Any]
 HERE = Path(__file__).parent
+SCRIPTS = ("page.js", "attitude.js")
 
 
 def page(reports: Sequence[Report]) -> str:
     """The page of one run, or of several overlaid. Raises ValueError if there is none."""
     if not reports:
         raise ValueError("a page needs a run")
-    from plotly.offline import get_plotlyjs
-
-    blocks: Json = {"trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, **blocks)
-    environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
-    environment.tests["grave"] = rows.grave
-    scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")]
-    hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
-    runs, drawn = [report.findings for report in reports], drawings(reports)
-    return environment.get_template("page.html").render(
-        reports=reports, runs=list(enumerate(reports)), several=len(reports) > 1,
-        policy=f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:",
-        style=(HERE / "page.css").read_text(encoding="utf-8"), scripts=scripts,
-        data=page_data(reports, drawn), drawings=drawn, colours=COLOURS,
+    runs = [report.findings for report in reports]
+    return rendered(
+        "page.html", reports,
         rows=rows.figure_rows(runs), differences=differences(reports),
         configuration=keys_by_section([report.settings for report in reports]),
         facts=keys_by_section([report.facts for report in reports]),
         missing=[rows.missing(run) for run in runs], theorem=[rows.theorem_sentences(run) for run in runs],
         durations=rows.durations(runs), percentiles=[f"{name}#" for name in rows.PERCENTILES.values()],
         verdict=verdict, largest_error=largest_error, thinned=max(reports, key=lambda report: report.thinned),
+    )  # fmt: skip
+
+
+def rendered(template: str, reports: Sequence[Report], *more: str, live: bool = False, **names: Any) -> str:
+    """A template with the drawings of some runs and `more` scripts; of a live page the lines are empty."""
+    from plotly.offline import get_plotlyjs
+
+    blocks: Json = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, **blocks)
+    environment.filters |= {each.__name__: each for each in (seconds, percent, rows.shown, rows.count, rows.micros)}
+    environment.tests["grave"] = rows.grave
+    scripts = [get_plotlyjs(), *((HERE / name).read_text(encoding="utf-8") for name in (*SCRIPTS, *more))]
+    hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
+    policy = f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:"
+    drawn = drawings(reports)
+    return environment.get_template(template).render(
+        reports=reports, runs=list(enumerate(reports)), several=len(reports) > 1, colours=COLOURS,
+        policy=policy + ("; connect-src 'self'" if live else ""), scripts=scripts,
+        style=(HERE / "page.css").read_text(encoding="utf-8"), data=page_data(reports, drawn, live=live),
+        drawings=drawn, span=span_of(reports), **names,
     )  # fmt: skip
 
 

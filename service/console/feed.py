@@ -1,0 +1,235 @@
+"""Feed of the console: what is published of every vehicle, as the newest states and the last minute of columns.
+
+A client of the network that only subscribes. The plant's trace has every tick's measurement, voltages and latency, of
+which at most `ROWS_HZ` a second are kept; what the controller computes is held from its telemetry. Sans-I/O but for
+`subscribe`: a message is a key and bytes, and time is an argument.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import islice
+from math import degrees, nan, sqrt
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry
+from aeroloop.protocol.messages.trace import NEVER, Batch, Outcome, Sent, read_batch
+from aeroloop.protocol.wire.attitude import IDENTITY, angle, received_quaternion, to_euler
+from aeroloop.service.config import ConfigError, Settings, from_description
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.registry import LawError, initial_state, law_of
+from aeroloop.service.host.operator import Gathered
+from aeroloop.service.review.report import Findings, Line, Panel, Report
+
+LAST_S: Final = 60.0
+"""What of the columns is kept and shown."""
+ROWS_HZ: Final = 50.0
+EVENTS: Final = 200
+SHOWN: Final = ("description", "status", "telemetry", "event", "trace")
+
+Column = tuple[str, str, str]  # group of panels, panel, quantity
+
+
+def panels_of(settings: Settings, radius: float | None) -> list[Panel]:
+    """Panels of a live page, without any value; of `radius` is a bound on ‖z‖, if one is proven."""
+    nothing = np.empty(0)
+
+    def panel(group: str, title: str, label: str, unit: str, *quantities: str) -> Panel:
+        return Panel(
+            group, title, label, unit, [Line(name, nothing, name in ("desired", "bound")) for name in quantities]
+        )
+
+    both = ("measured", "desired")
+    angles = [panel("angles", "Roll, pitch and yaw", name, "°", *both) for name in ("roll", "pitch", "yaw")]
+    attitude = [panel("attitude", "Attitude", name, "1", *both) for name in ("η", "ε₁", "ε₂", "ε₃")]
+    errors = [panel("error", "Attitude error", f"ε̃{i}", "1", "measured") for i in "₁₂₃"]
+    motors = [panel("input", "Input", f"u{'₁₂₃₄₅₆₇₈'[i - 1]}", "V", "commanded") for i in settings.wire.motors]
+    found = [*angles, panel("error_angle", "Attitude error, as an angle", "angle", "°", "measured"), *errors, *motors]
+    if not settings.loop.lockstep:
+        found.append(panel("latency", "Loop latency", "latency", "ms", "latency"))
+    with suppress(LawError):
+        for name, values in initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)).items():
+            title, symbol = name.replace("_", " ").capitalize(), {"damping_estimate": "θ̂"}.get(name, name)
+            found += [panel(name, title, f"{symbol}{i + 1}", "1", "estimated") for i in range(len(values))]
+    if radius is not None:
+        found.append(panel("theorem", "Error of Theorem 1", "‖z‖", "1", "measured", "bound"))
+    return [*found, *attitude]
+
+
+class Vehicle:
+    """What is known of one vehicle."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.statuses: dict[str, tuple[float, Status]] = {}  # by role, with when it was received [s]
+        self.described: dict[str, Description] = {}
+        self.telemetry: deque[Telemetry] = deque(maxlen=16)  # of the session, the newest last
+        self.settings: Settings | None = None
+        self.radius: float | None = None  # of ‖z‖, where it is proven
+        self.columns: list[Column] = []
+        self.session = ""
+        self.rows: deque[list[float]] = deque(maxlen=round(LAST_S * ROWS_HZ))  # time, then a value a column
+        self.count = 0  # rows of the session so far, so that a page knows which it lacks
+        self.generation = 0  # of the description; a page with another one is loaded anew
+        self._sent_us: deque[tuple[int, int]] = deque(maxlen=256)  # session tick, and when its measurement was sent
+        self._attitude = IDENTITY
+        self._measured: list[float] = [nan] * 7
+
+    def describe(self, description: Description) -> None:
+        """Take a role's description; of the ends it says how frames are read and what is drawn."""
+        if self.described.get(description.role) == description or description.role not in ("plant", "controller"):
+            return
+        self.described[description.role] = description
+        source = self.described.get("controller", description)
+        with suppress(ConfigError):
+            self.settings = from_description(source.config)
+            certificate = (source.certificate or {}) if isinstance(self.settings.law, AdaptiveSettings) else {}
+            self.radius = certificate.get("pointwise_radius") if certificate.get("holds") else None
+            panels = panels_of(self.settings, self.radius)
+            self.columns = [(each.group, each.label, line.label) for each in panels for line in each.lines]
+            self.generation += 1
+            self.rows.clear()
+
+    def report(self) -> Report:
+        """A run without any tick, for the page."""
+        settings = self.settings
+        findings = Findings.model_construct(marks=[], faults=[], gaps=[])
+        panels = panels_of(settings, self.radius) if settings else []
+        return Report(self.name, findings, np.empty(0), panels, 1, settings.description() if settings else {})
+
+    def add(self, batch: Batch) -> None:
+        """Add rows of the plant's trace."""
+        settings, columns = self.settings, batch.columns
+        if settings is None or batch.header.end != "plant" or not batch.header.session or not batch.header.rows:
+            return
+        if batch.header.row_dtype.itemsize == 0 or batch.header.measurement_bytes != settings.wire.measurement.size:
+            return
+        if batch.header.session != self.session:
+            self.session, self.count = batch.header.session, 0
+            self.rows.clear()
+            self._sent_us.clear()
+        stride = max(1, round(settings.loop.rate_hz / ROWS_HZ))
+        base_us = batch.header.monotonic_ns // 1000
+        for i, tick in enumerate(columns["session_tick"].tolist()):
+            if columns["sent_as"][i] == Sent.FRAME:
+                self._sent_us.append((tick, base_us + int(columns["sent"][i])))
+                self._read(settings, columns["measurement"][i].tobytes())
+            if tick % stride == 0:
+                latency = self._latency_ms(columns, i, base_us)
+                self.rows.append(self._row(settings, tick, columns["voltages"][i].tolist(), latency))
+                self.count += 1
+
+    def _read(self, settings: Settings, frame: bytes) -> None:
+        """Take the attitude of a measurement."""
+        if (read := settings.wire.measurement.unpack(frame)) is None:
+            return
+        x, y, z = map(settings.wire.attitude.quantizer().level, read[1][:3])
+        if x == x and y == y and z == z:
+            self._attitude = received_quaternion(x, y, z, self._attitude)
+
+    def _latency_ms(self, columns: Mapping[str, Any], i: int, base_us: int) -> float:
+        """From a measurement sent to its answer received, of the command that acted at a row; NaN where none did."""
+        answered, received = int(columns["answered"][i]), int(columns["received"][i])
+        if columns["outcome"][i] != Outcome.ACTED or NEVER in (answered, received):
+            return nan
+        sent = next((at for tick, at in reversed(self._sent_us) if tick == answered), None)
+        return nan if sent is None else (base_us + received - sent) * 1e-3
+
+    def _row(self, settings: Settings, tick: int, voltages: Sequence[float], latency: float) -> list[float]:
+        """Values of all columns at a tick, by groups in the order of `panels_of`."""
+        # what the controller computed last by then; a batch of the trace comes after the telemetry of its ticks
+        its = (each for each in reversed(self.telemetry) if each.session == self.session and each.tick <= tick)
+        seen, known = self._attitude, next(its, None)
+        desired: tuple[float, ...] = known.desired if known else (nan,) * 4
+        if known and sum(a * b for a, b in zip(seen, desired, strict=True)) < 0:
+            desired = tuple(-part for part in desired)
+        error = known.attitude_error if known else (nan,) * 3
+        values = {
+            "angles": [each for pair in zip(_angles(seen), _angles(desired), strict=True) for each in pair],
+            "attitude": [each for pair in zip(seen, desired, strict=True) for each in pair],
+            "error_angle": [degrees(angle(*error)) if known else nan],
+            "error": error,
+            "input": voltages,
+            "latency": [latency],
+            "theorem": [_z(settings, known), self.radius or nan],
+            **(known.state if known else {}),
+        }
+        parts = {group: iter(numbers) for group, numbers in values.items()}
+        return [tick * settings.loop.period, *(next(parts.get(group, iter(())), nan) for group, *_ in self.columns)]
+
+
+def _angles(q: Sequence[float]) -> tuple[float, ...]:
+    return tuple(map(degrees, to_euler((q[0], q[1], q[2], q[3])))) if q[0] == q[0] else (nan,) * 3
+
+
+def _z(settings: Settings, known: Telemetry | None) -> float:
+    """‖z‖ of the measurement, of the paper's law with its configured gains; else NaN."""
+    if known is None or not isinstance(settings.law, AdaptiveSettings):
+        return nan
+    eps, sign = known.attitude_error, known.state.get("sign", (1.0,))[0]
+    eta = sqrt(max(0.0, 1 - sum(part * part for part in eps)))
+    z2 = [w + sign * c * e for w, c, e in zip(known.rate_error, settings.law.C1, eps, strict=True)]
+    return sqrt((1 - eta) ** 2 + sum(part * part for part in (*eps, *z2)))
+
+
+class Feed:
+    """All vehicles of a network. Its lock is held while messages are taken and while a page's block is made."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.vehicles: dict[str, Vehicle] = {}
+        self.events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=EVENTS)
+        self._numbered = 0
+
+    def take(self, key: str, payload: bytes, now_s: float, wall_s: float) -> None:
+        """Take a message; what cannot be read, as of another version, is dropped."""
+        address = topics.read_key(key)
+        if address is None or address.topic.name not in SHOWN:
+            return
+        with self.lock, suppress(ValidationError, ValueError, KeyError):
+            vehicle = self.vehicles.setdefault(address.vehicle, Vehicle(address.vehicle))
+            match address.topic.name:
+                case "description":
+                    vehicle.describe(Description.model_validate_json(payload))
+                case "status":
+                    vehicle.statuses[address.role or ""] = now_s, Status.model_validate_json(payload)
+                case "telemetry":
+                    vehicle.telemetry.append(Telemetry.model_validate_json(payload))
+                case "trace":
+                    if (batch := read_batch(payload)) is not None:
+                        vehicle.add(batch)
+                case _:
+                    event = Event.model_validate_json(payload)
+                    shown = {"at": wall_s, "vehicle": address.vehicle, "role": address.role or event.role}
+                    self._numbered += 1
+                    shown |= {"kind": event.kind, "text": event.text, "tick": event.tick, "session": event.session}
+                    self.events.append((self._numbered, shown))
+
+    def gathered(self, now_s: float) -> Gathered:
+        """Statuses by vehicle and role, each with its age, as `op status` has them."""
+        statuses = {
+            name: {
+                role: status.model_copy(update={"age_s": now_s - at}) for role, (at, status) in vehicle.statuses.items()
+            }
+            for name, vehicle in self.vehicles.items()
+        }
+        return Gathered({name: roles for name, roles in statuses.items() if roles}, [])
+
+    def block(self, name: str, rows_after: int, events_after: int, session: str) -> dict[str, Any]:
+        """Rows and events that a page lacks: of rows those that are still kept, of a new session all."""
+        events = [event for number, event in self.events if number > events_after]
+        found: dict[str, Any] = {"events": events, "numbered": self._numbered}
+        if (vehicle := self.vehicles.get(name)) is not None:
+            lacks = vehicle.count - (rows_after if session == vehicle.session else 0)
+            kept = len(vehicle.rows)
+            rows = list(islice(vehicle.rows, max(0, kept - lacks), kept))
+            found |= {"session": vehicle.session, "count": vehicle.count, "generation": vehicle.generation}
+            found["rows"] = [[None if x != x else round(x, 6) for x in row] for row in rows]
+        return found

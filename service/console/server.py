@@ -1,0 +1,197 @@
+"""Server of the console: one page over HTTP, and a socket for what it shows and what an operator asks for.
+
+Only a further client of the network, in a process of its own. A page needs the token of the printed address; requests
+of another host or origin are refused. Each page has a thread, which sends the newest block once the last is gone, so a
+slow page has no queue. Without an operator's certificate where the network has certificates, nothing is sent there.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import ssl
+import time
+from contextlib import suppress
+from http import HTTPStatus
+from ipaddress import ip_address
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+import zenoh
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.sync.server import ServerConnection, serve
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.transport.history import RecoveringSubscriber
+from aeroloop.protocol.transport.network import joined_session
+from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.service.console.feed import SHOWN, Feed, Vehicle
+from aeroloop.service.console.verbs import Verbs
+from aeroloop.service.host.health import troubles
+from aeroloop.service.report.page import rendered
+
+BLOCK_S: Final = 0.1  # at most so many blocks a second go to a page
+_POLICY: Final = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
+
+
+class ConsoleError(AeroloopError):
+    """The console cannot be served; one line with the reason and what to do."""
+
+
+class Console:
+    """A console of a network: pages are served until it is closed. `url` has the token."""
+
+    def __init__(
+        self, network: NetworkSettings, address: str, port: int, tls: tuple[Path, Path] | None, vehicle: str | None
+    ) -> None:
+        local = address == "localhost" or ip_address(address).is_loopback
+        if tls is None and not local:
+            raise ConsoleError(
+                f"{address} is beyond this host, where the console speaks TLS only: give --tls CERTIFICATE KEY, or "
+                "forward a port by ssh"
+            )
+        self._feed, self._vehicle, self._token = Feed(), vehicle, secrets.token_urlsafe(24)
+        self._session = joined_session(network)
+        here = self._session.__enter__()
+        certificate = here.certificate
+        self.reads_only = certificate is not None and certificate.role != "operator"
+        self._verbs = Verbs(network, here, self._feed)
+        keys = [topics.key(name, "*") for name in SHOWN if name != "description"]
+        self._subscribers = [here.session.declare_subscriber(key, self._receive) for key in keys]
+        self._descriptions = RecoveringSubscriber(here.session, topics.key("description", "*"))
+        context = None
+        if tls is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(*tls)
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # no line for each page
+        try:
+            self._server = serve(
+                self._page, address, port, ssl=context, process_request=self._request, compression=None, max_size=65_536
+            )
+        except OSError as error:
+            self._session.__exit__(None, None, None)
+            raise ConsoleError(f"cannot listen on {address}:{port}: {error.strerror}; choose another --port") from None
+        port = self._server.socket.getsockname()[1]
+        host = f"[{address}]" if ":" in address else address
+        names = {"localhost", "127.0.0.1", "[::1]"} if local else {host}
+        self._hosts = {f"{name}:{port}" for name in names}
+        self.origin = f"{'https' if tls else 'http'}://{host}:{port}"
+        self._origins = {f"{'https' if tls else 'http'}://{each}" for each in self._hosts}
+        self.url = f"{self.origin}/?token={self._token}"
+
+    def run(self, stop: Event) -> None:
+        """Serve until `stop` is set."""
+        Thread(target=self._server.serve_forever, daemon=True).start()
+        while not stop.wait(BLOCK_S):
+            for one in self._descriptions.take():
+                self._feed.take(one.key, one.payload, time.monotonic(), one.published_ns * 1e-9)
+        self._server.shutdown()
+        self._session.__exit__(None, None, None)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        self._feed.take(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic(), time.time())
+
+    # ── HTTP ──
+
+    def _request(self, _: ServerConnection, request: Request) -> Response | None:
+        """Answer a request, or let the socket of one of our own pages through."""
+        path = urlsplit(request.path)
+        given = parse_qs(path.query).get("token", [""])[0]
+        origin = request.headers.get("Origin")
+        if request.headers.get("Host", "") not in self._hosts or origin not in (None, *self._origins):
+            return _answer(HTTPStatus.FORBIDDEN, "a request of another host or origin\n")
+        if not secrets.compare_digest(given, self._token):
+            return _answer(HTTPStatus.UNAUTHORIZED, "the address lacks its token: `aeroloop op console` prints it\n")
+        if path.path == "/socket":
+            return None if origin is not None else _answer(HTTPStatus.FORBIDDEN, "a socket without an origin\n")
+        if path.path != "/":
+            return _answer(HTTPStatus.NOT_FOUND, "nothing is here\n")
+        vehicle = self._named(parse_qs(path.query).get("vehicle", [""])[0])
+        with self._feed.lock:
+            html = rendered(
+                "console.html", [vehicle.report()], "console.js", live=True, vehicle=vehicle.name,
+                generation=vehicle.generation, columns=vehicle.columns, reads_only=self.reads_only,
+            )  # fmt: skip
+        return _answer(HTTPStatus.OK, html, "text/html; charset=utf-8")
+
+    def _named(self, name: str) -> Vehicle:
+        """The vehicle asked for, else the configured one, else the first with a plant or a controller."""
+        with self._feed.lock:
+            known = self._feed.vehicles
+            first = next(
+                (each for each, its in sorted(known.items()) if {"plant", "controller"} & its.statuses.keys()), ""
+            )
+            return known.get(name or self._vehicle or first) or Vehicle(name or self._vehicle or first or "aero")
+
+    # ── a page's socket ──
+
+    def _page(self, socket: ServerConnection) -> None:
+        """Answer what a page asks for, while a thread of its own sends what it shows; nothing delays a stop."""
+        assert socket.request is not None
+        name = self._named(parse_qs(urlsplit(socket.request.path).query).get("vehicle", [""])[0]).name
+        Thread(target=self._stream, args=(socket, name), daemon=True).start()
+        with suppress(ConnectionClosed, OSError):
+            for text in socket:
+                try:
+                    asked = json.loads(text)
+                    verb = str(asked["verb"])
+                except (ValueError, KeyError, TypeError):
+                    continue  # of no page of ours
+                if verb == "stop":
+                    Thread(target=self._answer, args=(socket, verb, asked), daemon=True).start()
+                else:
+                    self._answer(socket, verb, asked)
+
+    def _stream(self, socket: ServerConnection, name: str) -> None:
+        """Send the newest block, over and over: while one is on its way, no other is made."""
+        rows, events, session = 0, 0, ""
+        with suppress(ConnectionClosed, OSError):
+            while True:
+                with self._feed.lock:
+                    found = self._feed.gathered(time.monotonic())
+                    block = self._feed.block(name, rows, events, session)
+                rows, events, session = block.get("count", 0), block["numbered"], block.get("session", "")
+                statuses = {
+                    vehicle: {role: _shown(status) for role, status in roles.items()}
+                    for vehicle, roles in found.statuses.items()
+                }
+                wrong = [{"vehicle": one.vehicle, "role": one.role, "text": one.text} for one in troubles(found)]
+                socket.send(json.dumps({"type": "block", "vehicles": statuses, "troubles": wrong, **block}))
+                time.sleep(BLOCK_S)
+
+    def _answer(self, socket: ServerConnection, verb: str, asked: dict[str, Any]) -> None:
+        """Do what a page asks for, and send what came of it."""
+        answer: dict[str, Any] = {"type": "answer", "number": asked.get("number"), "verb": verb}
+        try:
+            if self.reads_only and verb != "preview":
+                raise ConsoleError("this console only reads: it has no operator's certificate")
+            answer |= self._verbs.do(verb, asked)
+        except (AeroloopError, ValueError, KeyError, TypeError, IndexError) as error:
+            answer |= {"failed": str(error)}
+        with suppress(ConnectionClosed, OSError):
+            socket.send(json.dumps(answer))
+
+
+def _shown(status: Status) -> dict[str, Any]:
+    """What a page shows of a status."""
+    names = "state session cause age_s rate_hz skipped recent_skipped lost lacks_recorder reference notes unkept"
+    found = {name: getattr(status, name) for name in names.split()}
+    if status.recent_latency_us is not None:
+        found["latency_us"] = [status.recent_latency_us.p50, status.recent_latency_us.p99]
+    if status.gains is not None:
+        found["gains"] = {name: list(gain) for name, gain in status.gains.named.items()}
+    found["faults"] = [fault.fault for fault in status.faults if fault.end_tick is None]
+    return found
+
+
+def _answer(status: HTTPStatus, body: str, kind: str = "text/plain; charset=utf-8") -> Response:
+    payload = body.encode()
+    headers = Headers({"Content-Type": kind, "Content-Length": str(len(payload)), "Connection": "close", **_POLICY})
+    return Response(status.value, status.phrase, headers, payload)
