@@ -23,6 +23,7 @@ _EXTRAS: Final = {
     **dict.fromkeys(("pyarrow", "scipy"), "export"),
     "distributed": "dask",
     "foxglove": "foxglove",
+    "websockets": "console",
 }
 """Modules that the core installs without, and the extra that brings each."""
 

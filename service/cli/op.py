@@ -1,12 +1,11 @@
 """`aeroloop op`: an operator's verbs, sent to running roles over the network.
 
-They address the configured vehicle. Where none is configured, `stop`, `status` and `top` are about every vehicle on the
-network, and the others about the only one: where there are several, they refuse.
+They address the configured vehicle. Where none is configured, `stop`, `status` and `console` are about every vehicle on
+the network, and the others about the only one: where there are several, they refuse.
 """
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,16 +73,6 @@ def status(
     show(tree, json, lambda _: trouble_sheets(found, wrong))
     if wrong:
         raise typer.Exit(1)
-
-
-@group.command()
-def top(config: Config = None, overrides: Overrides = None) -> None:
-    """Show every vehicle and role on the network, live; ^C quits."""
-    target, _ = _target(config, overrides)
-    from aeroloop.service.terminal.monitor import watch
-
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which restores the terminal, as ^C does
-    watch(target.network)
 
 
 @group.command()

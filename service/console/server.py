@@ -135,8 +135,8 @@ class Console:
     def _page(self, socket: ServerConnection) -> None:
         """Answer what a page asks for, while a thread of its own sends what it shows; nothing delays a stop."""
         assert socket.request is not None
-        name = self._named(parse_qs(urlsplit(socket.request.path).query).get("vehicle", [""])[0]).name
-        Thread(target=self._stream, args=(socket, name), daemon=True).start()
+        name, shown = self._named(parse_qs(urlsplit(socket.request.path).query).get("vehicle", [""])[0]).name, Event()
+        Thread(target=self._stream, args=(socket, name, shown), daemon=True).start()
         with suppress(ConnectionClosed, OSError):
             for text in socket:
                 try:
@@ -144,13 +144,16 @@ class Console:
                     verb = str(asked["verb"])
                 except (ValueError, KeyError, TypeError):
                     continue  # of no page of ours
-                if verb == "stop":
+                if verb == "shown":
+                    shown.set()
+                elif verb == "stop":
                     Thread(target=self._answer, args=(socket, verb, asked), daemon=True).start()
                 else:
                     self._answer(socket, verb, asked)
+        shown.set()
 
-    def _stream(self, socket: ServerConnection, name: str) -> None:
-        """Send the newest block, over and over: while one is on its way, no other is made."""
+    def _stream(self, socket: ServerConnection, name: str, shown: Event) -> None:
+        """Send the newest block, over and over, each once the page has `shown` the last: a slow one has no queue."""
         rows, events, session = 0, 0, ""
         with suppress(ConnectionClosed, OSError):
             while True:
@@ -163,8 +166,10 @@ class Console:
                     for vehicle, roles in found.statuses.items()
                 }
                 wrong = [{"vehicle": one.vehicle, "role": one.role, "text": one.text} for one in troubles(found)]
+                shown.clear()
                 socket.send(json.dumps({"type": "block", "vehicles": statuses, "troubles": wrong, **block}))
                 time.sleep(BLOCK_S)
+                shown.wait()
 
     def _answer(self, socket: ServerConnection, verb: str, asked: dict[str, Any]) -> None:
         """Do what a page asks for, and send what came of it."""

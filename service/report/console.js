@@ -191,6 +191,7 @@ function connect() {
     append(message);
     showEvents(message.events);
     showStatuses();
+    socket.send('{"verb":"shown"}');
   };
   socket.onclose = () => setTimeout(connect, 1000);
 }

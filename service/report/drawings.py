@@ -99,7 +99,8 @@ def _drawing(group: str, reports: Sequence[Report], shapes: list[Json], labels: 
                     stroke["shape"] = "hv" if line.held and reports[run].thinned <= 2 else "linear"
                     traces.append({
                         "type": "scatter", "mode": "lines", "times": run, "yaxis": axes[rows[panel.label]],
-                        "y": line.values.astype("<f4"), "panel": panel.label, "quantity": line.label, "unit": panel.unit.removeprefix("1"),
+                        "y": line.values.astype("<f4"),
+                        "panel": panel.label, "quantity": line.label, "unit": panel.unit.removeprefix("1"),
                         "line": stroke, "name": _plain(entry), "legendgroup": entry, "showlegend": entry not in known,
                         "hovertemplate": _plain(f"{name}: %{{y:.4~g}} {panel.unit.strip('1')}") + "<extra></extra>",
                         # A line that is published less often than every tick has no gaps between its values.

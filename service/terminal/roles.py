@@ -1,4 +1,4 @@
-"""Roles of a vehicle as `op status` and `op top` show them: a row each, and a row for each cause and note.
+"""Roles of a vehicle as `op status` shows them: a row each, and a row for each cause and note.
 
 What is silent is marked with the age of its last status.
 """

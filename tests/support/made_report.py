@@ -53,7 +53,7 @@ def made_report(
         *(
             Panel("attitude", "Figure C.7: Attitude with quantization", label, "1",
                   [Line("measured", measured), Line("desired", desired, desired=True)])
-            for label in ("ε₁", "ε₂")
+            for label in ("η", "ε₁", "ε₂", "ε₃")
         ),
         Panel("error", "Figure C.9: Attitude error with quantization", "ε̃₁", "1",
               [Line("measured", measured)]),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html import escape
@@ -12,28 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
 from aeroloop.service.report.page import page
 from aeroloop.service.review.report import Check, Line, Mark, Panel
+from tests.support.browser import PATIENCE_MS, chromium
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, with_faults
 
-PATIENCE_MS = 120_000  # nothing here is about speed; a browser on a busy machine may take its time
 Open = Callable[[str], Page]
 
 
 @pytest.fixture(scope="module")
 def open_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
     """Opens a page; in the end, none has requested anything or complained of anything."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if found is None:
-        assert "CI" not in os.environ, "CI has a Chromium"
-        pytest.skip("no Chromium on PATH")
-    arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
-                 "--disable-component-update", "--disable-sync"]  # fmt: skip
     folder, numbers, complaints = tmp_path_factory.mktemp("pages"), count(), list[str]()
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=arguments, timeout=PATIENCE_MS)
+    with chromium() as browser:
 
         def open_page(html: str) -> Page:
             out = folder / f"{next(numbers)}.html"
@@ -48,10 +39,10 @@ def open_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
             opened.on("console", lambda message: complaints.append(message.text))
             opened.on("pageerror", lambda error: complaints.append(str(error)))
             opened.goto(out.as_uri())
+            opened.wait_for_selector("body[data-drawn]")
             return opened
 
         yield open_page
-        browser.close()
     assert complaints == []
 
 
@@ -92,7 +83,7 @@ def test_every_panel_is_drawn_when_the_page_opens_so_that_a_saved_page_has_its_d
         plot.dataset.name,
         [...plot.querySelectorAll(".scatterlayer .js-line")].filter((path) => path.getTotalLength() > 100).length,
     ])"""
-    drawn = [["attitude", 4], ["error", 1], ["input", 1], ["damping_estimate", 1], ["latency", 1]]
+    drawn = [["attitude", 8], ["error", 1], ["input", 1], ["damping_estimate", 1], ["latency", 1]]
     assert one.evaluate(lines) == drawn
     opened = open_page(f"<!doctype html>{one.evaluate('document.documentElement.outerHTML')}")
     assert opened.evaluate(lines) == drawn
@@ -133,6 +124,32 @@ def test_a_zoom_an_event_a_gap_and_keys_move_the_time_that_every_panel_shows(one
     shows(one, "input", (6.8, 7.8))
     panel.dblclick()
     wait_for(one, "latency", "plot.layout.xaxis.range[0] < 0 && plot.layout.xaxis.range[1] > 10")
+
+
+def test_the_cursor_is_one_instant_of_plots_readings_events_and_the_address(open_page: Open) -> None:
+    opened = open_page(page([made_report()]))
+    first = "document.querySelector('#readings tr').innerText"
+    opened.get_by_role("button", name="A tick on").click()
+    assert opened.evaluate(first).split() == ["0.002", "s", "tick", "1"]
+    opened.evaluate("goTo(3.25)")
+    assert opened.evaluate("location.hash") == "#t=3.250"
+    shown = opened.evaluate("shown")
+    line = opened.locator(".plot[data-name=input] .cursor")
+    assert line.is_visible()
+    left = float(line.evaluate("(line) => parseFloat(line.style.left)"))
+    width = opened.locator(".plot[data-name=input]").evaluate("(plot) => plot.clientWidth")
+    assert left == pytest.approx(78 + (3.25 - shown[0]) / (shown[1] - shown[0]) * (width - 88), abs=1)
+    past = opened.locator("#events tr.past").count()
+    assert 0 < past < opened.locator("#events [data-time]").count()
+    assert opened.locator("#events tr.now").count() == 1
+    before = opened.evaluate("scene.toDataURL()")
+    opened.locator("body").press("Space")
+    opened.wait_for_function("() => cursor > 3.5")
+    opened.locator("body").press("Space")
+    assert opened.evaluate("playing") == 0
+    assert opened.evaluate("scene.toDataURL()") != before
+    opened.evaluate("location.hash = '#t=7.5'")
+    opened.wait_for_function("() => Math.abs(cursor - 7.5) < 1e-9")
 
 
 def test_hostile_text_of_a_log_is_text(two: Page) -> None:

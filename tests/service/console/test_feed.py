@@ -1,0 +1,80 @@
+"""Feed of the console: its columns are the log's, whatever is received in between; a slow page gets what is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event
+from aeroloop.service.config import load
+from aeroloop.service.console.feed import Feed, panels_of
+from aeroloop.service.logs.ticks import euler_deg
+from aeroloop.service.review.review import read
+from tests.support.made_log import START_NS, VEHICLE, description, made, write
+
+TICKS = 1000
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Feed, dict[str, np.ndarray], np.ndarray]:
+    """A loop as a page is given it, and as its log has it: time and columns by name, and times."""
+    settings = load()
+    messages, feed = made(settings, TICKS), Feed()
+    for role in ("plant", "controller"):
+        key = topics.key("description", VEHICLE, role=role)
+        feed.take(key, description(settings, role).encode(), 0.0, 0.0)
+    for message in messages:
+        feed.take(message.key, message.payload, (message.at_ns - START_NS) * 1e-9, 0.0)
+    log = read(write(tmp_path_factory.mktemp("feed") / "a.mcap", settings, messages))
+    k, columns = log.ticks.k, {}
+    for name, values in (("roll", 0), ("pitch", 1), ("yaw", 2)):
+        columns[name] = euler_deg(log.ticks.attitude)[:, values]
+    columns |= {"u₂": log.ticks.voltages[:, 0], "latency": log.ticks.latency_ns * 1e-6, "k": k}
+    return feed, columns, k * settings.loop.period
+
+
+def test_rows_are_those_of_the_log_at_fifty_a_second(both: tuple[Feed, dict[str, np.ndarray], np.ndarray]) -> None:
+    feed, logged, _ = both
+    vehicle, block = feed.vehicles[VEHICLE], feed.block(VEHICLE, 0, 0, "")
+    rows = np.array([[np.nan if value is None else value for value in row] for row in block["rows"]])
+    assert rows[:, 0] == pytest.approx(np.arange(0, TICKS, 10) * 0.002)
+    assert block["count"] == len(rows) == 100
+    at = {(group, panel, quantity): i + 1 for i, (group, panel, quantity) in enumerate(vehicle.columns)}
+    for name in ("roll", "pitch", "yaw"):
+        found = rows[:, at["angles", name, "measured"]]
+        assert found == pytest.approx(logged[name][::10], abs=1e-5)
+    # The voltages of a row are those in force from it on: of the tick before, as a command acts a period later.
+    assert rows[1:, at["input", "u₂", "commanded"]] == pytest.approx(logged["u₂"][9:-1:10], abs=1e-6)
+    assert rows[1:, at["latency", "latency", "latency"]] == pytest.approx(logged["latency"][9:-1:10], abs=2e-3)
+    desired = rows[:, at["angles", "yaw", "desired"]]
+    assert np.isfinite(desired[1:]).all()
+    assert np.abs(np.diff(desired[1:])).max() < 2  # of telemetry, ten times a second
+
+
+def test_a_page_gets_what_it_lacks_once_and_of_a_new_session_all(
+    both: tuple[Feed, dict[str, np.ndarray], np.ndarray],
+) -> None:
+    feed, *_ = both
+    whole = feed.block(VEHICLE, 0, 0, "")
+    assert [row[0] for row in feed.block(VEHICLE, 90, 0, "s1")["rows"]] == [row[0] for row in whole["rows"][90:]]
+    assert feed.block(VEHICLE, whole["count"], whole["numbered"], "s1")["rows"] == []
+    assert len(feed.block(VEHICLE, 90, 0, "of before")["rows"]) == 100
+    assert feed.block("another", 0, 0, "").get("rows") is None
+    event = Event(role="plant", kind="marked", text="here", session="s1", tick=7)
+    feed.take(topics.key("event", VEHICLE, role="plant"), event.encode(), 1.0, 1000.0)
+    (shown,) = feed.block(VEHICLE, 0, whole["numbered"], "s1")["events"]
+    assert (shown["at"], shown["role"], shown["text"], shown["tick"]) == (1000.0, "plant", "here", 7)
+    feed.take(topics.key("event", VEHICLE, role="plant"), b"nonsense", 1.0, 1000.0)  # anyone may publish it
+    feed.take(topics.key("trace", VEHICLE, role="plant"), b"nonsense", 1.0, 1000.0)
+    assert feed.block(VEHICLE, 0, whole["numbered"] + 1, "s1")["events"] == []
+
+
+def test_a_bound_is_drawn_only_where_it_is_proven() -> None:
+    settings = load()
+    assert "theorem" not in {panel.group for panel in panels_of(settings, None)}
+    assert [line.label for panel in panels_of(settings, 0.2) if panel.group == "theorem" for line in panel.lines] == [
+        "measured",
+        "bound",
+    ]
+    assert "latency" not in {panel.group for panel in panels_of(load(overrides=["loop.lockstep=true"]), None)}
