@@ -23,6 +23,7 @@ _EXTRAS: Final = {
     **dict.fromkeys(("pyarrow", "scipy"), "export"),
     "distributed": "dask",
     "foxglove": "foxglove",
+    "prometheus_client": "metrics",
 }
 """Modules that the core installs without, and the extra that brings each."""
 

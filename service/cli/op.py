@@ -1,7 +1,7 @@
 """`aeroloop op`: an operator's verbs, sent to running roles over the network.
 
-They address the configured vehicle. Where none is configured, `stop`, `status` and `top` are about every vehicle on the
-network, and the others about the only one: where there are several, they refuse.
+They address the configured vehicle. Where none is configured, `stop`, `status`, `top` and `metrics` are about every
+vehicle on the network, and the others about the only one: where there are several, they refuse.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, report, show
+from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from threading import Event
 
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
     from aeroloop.service.config_sources import Target
@@ -82,6 +84,24 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which restores the terminal, as ^C does
     watch(target.network)
+
+
+@group.command()
+def metrics(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 9464,
+    address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Serve metrics of every vehicle to Prometheus until ^C. `show alerts` prints rules for them."""
+    target, _ = _target(config, overrides)
+
+    def run(stop: Event) -> None:
+        from aeroloop.service.host.metrics import serve
+
+        serve(target.network, stop, address, port, lambda url: typer.echo(f"metrics at {url} until ^C"))
+
+    run_alone(run)
 
 
 @group.command()
