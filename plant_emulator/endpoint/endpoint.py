@@ -16,6 +16,7 @@ the plant itself, except after `stop`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from math import acos, cos, degrees, hypot, isfinite, radians
 from typing import Any, Final, Literal, NamedTuple
@@ -114,6 +115,7 @@ class VehicleClaim:
         self.session: str | None = None
         self.holder: str | None = None
         self.trip: TripCause | None = None  # cause of the last trip, until it is cleared
+        self.trips: Counter[TripCause] = Counter()  # so far
         self.cause: str | None = None if armed else "not armed since it was started"  # why the latch refuses claims
         self.operator_only = False  # whether only an operator's `arm` clears the latch
         self.unavailable: str | None = None  # the owner's reason to refuse every claim, such as a bus fault
@@ -285,6 +287,7 @@ class VehicleClaim:
     def _trip(self, cause: TripCause, reason: str) -> None:
         self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
         self.cause, self.trip = f"{reason}: 0 V", cause
+        self.trips[cause] += 1
 
     def _clear(self) -> None:
         self.cause = self.trip = None

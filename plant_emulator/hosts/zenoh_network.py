@@ -31,7 +31,7 @@ from aeroloop.protocol.messages.operator import Advance, Answer, Inject, Mark, M
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
 from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
-from aeroloop.protocol.runtime.timing import RollingHistogram
+from aeroloop.protocol.runtime.timing import LatencyHistogram, RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -78,6 +78,7 @@ class ZenohNetwork(PlantNetwork):
         self._link: ZenohLink | None = None
         self._trace = PlantTrace(endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
+        self._latency_counts = LatencyHistogram()
         self._counters = endpoint.wire.measurement.counters
         self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
         self._received = 0
@@ -135,7 +136,9 @@ class ZenohNetwork(PlantNetwork):
         if endpoint.outcome is Outcome.ACTED:
             tick, at_ns = self._sent_at[endpoint.answered % self._counters]
             if tick == endpoint.answered >= 0:
-                self._latency.add((sent_ns if arrival is None else arrival.at_ns) - at_ns)
+                latency_ns = (sent_ns if arrival is None else arrival.at_ns) - at_ns
+                self._latency.add(latency_ns)
+                self._latency_counts.add(latency_ns)
         elif endpoint.outcome is Outcome.STALE:
             text = "commands answer measurements older than the watchdog's time: refused"
             self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
@@ -188,6 +191,8 @@ class ZenohNetwork(PlantNetwork):
                 saturated=end.saturated if end else 0,
                 latency_us=self._latency.total.summary(),
                 recent_latency_us=self._latency.recent(),
+                latency_counts=self._latency_counts.report(),
+                trips=dict(endpoint.trips),
                 timing=self.timing.report() if self.timing else None,
                 notes=[*self.notes, *([end.plant.note] if end and end.plant.note else [])],
                 lacks_recorder="gone" if self._recorder.gone else None,

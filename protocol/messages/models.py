@@ -139,6 +139,20 @@ class Percentiles(Message):
     max: float
 
 
+LATENCY_BOUNDS_US: Final = 100, 200, 300, 400, 500, 700, 1000, 1500, 2000, 3000, 5000, 10_000, 20_000, 50_000, 100_000
+
+
+class LatencyCounts(Message):
+    """Latencies since the plant's start, counted at fixed bounds: a difference of two statuses counts those between."""
+
+    counts: list[Annotated[int, Field(ge=0)]] = Field(
+        min_length=len(LATENCY_BOUNDS_US) + 1,
+        max_length=len(LATENCY_BOUNDS_US) + 1,
+        description=f"how many were at most {', '.join(map(str, LATENCY_BOUNDS_US))} µs long; last, of any length",
+    )
+    sum_us: float = Field(ge=0, description="their sum [µs]")
+
+
 class Timing(Message):
     """Timing of a loop, since its start-up and over the last ten seconds."""
 
@@ -200,6 +214,10 @@ class Status(Message):
         default=None, description="plant: from a measurement sent to its answer, plant's clock"
     )
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
+    latency_counts: LatencyCounts | None = Field(default=None, description="plant: `latency_us`, as a histogram")
+    trips: dict[TripCause, Annotated[int, Field(ge=0)]] = Field(
+        default={}, description="plant: trips since start by cause; causes without any are left out"
+    )
     age_us: Percentiles | None = Field(
         default=None, description="controller: from a measurement received to its answer sent, last 10 s [µs]"
     )

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
+RECORDING: Final = "recording"  # state of a recorder that can write
 NOT_RECORDING: Final = "not recording"  # state of a recorder that cannot write
 STOPPED: Final = "stopped"  # state of a recorder in its last status, when it ends in order
 

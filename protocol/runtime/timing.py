@@ -6,13 +6,14 @@ CLOCK_MONOTONIC paces everything; the wall clock only stamps logs, and the tick 
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterable
 from itertools import accumulate
 from math import exp2, log2
 from typing import Final, Protocol
 
-from aeroloop.protocol.messages.models import Percentiles, Timing
+from aeroloop.protocol.messages.models import LATENCY_BOUNDS_US, LatencyCounts, Percentiles, Timing
 
 
 class Clock(Protocol):
@@ -141,6 +142,25 @@ class RollingHistogram:
             self._turned_ns = now_ns
             self._windows.append(Histogram())
         return Histogram(self._windows).summary()
+
+
+class LatencyHistogram:
+    """Latencies since start-up, counted between the bounds of `LatencyCounts`."""
+
+    BOUNDS_NS: Final = tuple(1000 * bound for bound in LATENCY_BOUNDS_US)
+
+    def __init__(self) -> None:
+        self._between = [0] * (len(self.BOUNDS_NS) + 1)
+        self._sum_ns = 0
+
+    def add(self, nanoseconds: int) -> None:
+        """Count one latency [ns]."""
+        self._between[bisect_left(self.BOUNDS_NS, nanoseconds)] += 1
+        self._sum_ns += nanoseconds
+
+    def report(self) -> LatencyCounts:
+        """The counts up to each bound."""
+        return LatencyCounts(counts=list(accumulate(self._between)), sum_us=self._sum_ns * 1e-3)
 
 
 class LoopTiming:

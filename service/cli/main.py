@@ -24,6 +24,7 @@ _EXTRAS: Final = {
     "distributed": "dask",
     "foxglove": "foxglove",
     "websockets": "console",
+    "prometheus_client": "metrics",
 }
 """Modules that the core installs without, and the extra that brings each."""
 

@@ -1,7 +1,7 @@
 """`aeroloop op`: an operator's verbs, sent to running roles over the network.
 
-They address the configured vehicle. Where none is configured, `stop`, `status` and `console` are about every vehicle on
-the network, and the others about the only one: where there are several, they refuse.
+They address the configured vehicle. Where none is configured, `stop`, `status`, `console` and `metrics` are about every
+vehicle on the network, and the others about the only one: where there are several, they refuse.
 """
 
 from __future__ import annotations
@@ -95,6 +95,24 @@ def console(
         served = Console(target.network, address, port, tls, vehicle)
         typer.echo(f"{'a page that only reads' if served.reads_only else 'the console'} is at {served.url}, until ^C")
         served.run(stop)
+
+    run_alone(run)
+
+
+@group.command()
+def metrics(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 9464,
+    address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Serve metrics of every vehicle to Prometheus until ^C. `show alerts` prints rules for them."""
+    target, _ = _target(config, overrides)
+
+    def run(stop: Event) -> None:
+        from aeroloop.service.host.metrics import serve
+
+        serve(target.network, stop, address, port, lambda url: typer.echo(f"metrics at {url} until ^C"))
 
     run_alone(run)
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from aeroloop.service.config import Settings
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+ALERTS = Path(__file__).parent.parent / "host" / "alerts.yml"
 
 group = typer.Typer()
 
@@ -104,6 +105,12 @@ def layout(config: Config = None, overrides: Overrides = None) -> None:
     from aeroloop.service.viewers.schemas import layout as describe
 
     typer.echo(describe(settings.vehicle, settings.wire.motors))
+
+
+@group.command()
+def alerts() -> None:
+    """Print rules of Prometheus for what `op metrics` serves."""
+    typer.echo(ALERTS.read_text(encoding="utf-8"), nl=False)
 
 
 @group.command()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Loss, LossReason, Status
 from aeroloop.protocol.messages.operator import MessageError
-from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
+from aeroloop.protocol.messages.states import NOT_RECORDING, RECORDING, STOPPED
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.history import SOON_S, Delivery, RecoveringSubscriber
 from aeroloop.service.recording.rolling import RollingLog
@@ -144,7 +144,7 @@ class Recorder:
         now, written = time.monotonic(), self.log.written
         notes = [f"{count} messages lost: {LOSS_REASONS[reason]}" for reason, count in sorted(self._lost.items())]
         notes += self._unreachable
-        state = STOPPED if self._role.stop.is_set() else NOT_RECORDING if self.log.trouble else "recording"
+        state = STOPPED if self._role.stop.is_set() else NOT_RECORDING if self.log.trouble else RECORDING
         rate_hz = (written - self._status_written) / max(now - self._status_at, 1e-3)
         self._role.status(Status(
             role=self._role.role, state=state, cause=self.log.trouble or None, uptime_s=self._role.uptime_s, ticks=0,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import getpass
 import json
+import re
 import socket
+import subprocess
 import time
 from datetime import UTC
 from math import degrees
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -20,7 +23,7 @@ from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil import Hil
 from tests.hil.test_recorder import assert_whole
-from tests.support.processes import PATIENT, aeroloop
+from tests.support.processes import AEROLOOP, LONGEST_S, PATIENT, aeroloop
 
 
 def op(hil: Hil, *words: str, code: int = 0) -> str:
@@ -57,6 +60,37 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
         assert 0 < plant.sent < 0.7 * plant.ticks
         assert 0 < controller.sent < 0.7 * controller.ticks
         assert log.figures.final_error_deg < 3
+
+
+def test_prometheus_scrapes_a_running_loop_and_the_stop_that_ends_it(hil: Hil) -> None:
+    """Slack: `PATIENT`'s."""
+    hil.start(settings=PATIENT)
+    network = f"network.rendezvous={hil.settings.network.rendezvous}"
+    command = [*AEROLOOP, "op", "metrics", "--port", "0", "--set", network]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            url = next(word for word in server.stdout.readline().split() if word.startswith("http://127.0.0.1:"))
+
+            def scraped(pattern: str) -> float:
+                with urlopen(url, timeout=LONGEST_S) as answer:  # noqa: S310  # as printed
+                    found = re.search(rf"^{pattern} (\S+)$", answer.read().decode(), re.MULTILINE)
+                return float(found[1]) if found else -1.0
+
+            of_plant = r'\{role="plant",vehicle="aero"\}'
+            hil.eventually("latencies", lambda: scraped(f"aeroloop_latency_seconds_count{of_plant}") > 250)
+            assert scraped(f"aeroloop_latency_seconds_sum{of_plant}") > 0
+            assert 0 <= scraped(r"aeroloop_attitude_error_radians\{.*\}") < 0.5
+            assert scraped(r'aeroloop_state\{.*state="running".*\}') == 1
+            stops = r"aeroloop_trips_total\{cause=\"operator's stop\".*\}"
+            assert scraped(stops) == 0
+            op(hil, "stop")
+            hil.eventually("the stop", lambda: scraped(stops) == 1)
+            assert scraped(r'aeroloop_state\{.*state="tripped".*\}') == 1
+            server.terminate()
+            assert (server.communicate(timeout=LONGEST_S), server.returncode) == (("", ""), 0)
+        finally:
+            server.kill()
 
 
 def test_the_body_follows_a_file_and_a_live_stream_which_is_held_when_it_falls_silent(hil: Hil, tmp_path: Path) -> None:

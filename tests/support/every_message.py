@@ -8,6 +8,7 @@ from aeroloop.protocol.messages.trace import PlantChange, Tail
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 LATENCY = models.Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
+COUNTS = models.LatencyCounts(counts=[0, 0, 1, 1, 1, 2, *[3] * 10], sum_us=1743.25)
 FAULT = models.FaultStatus(
     fault="command:drop=0.1@2", source="injected", begin_tick=1001, end_tick=None, changed=7, effect="commands dropped"
 )
@@ -34,9 +35,10 @@ MESSAGES: list[operator.Message] = [
     LATENCY,
     models.Status(
         role="plant", state="driven", session="5f0c", uptime_s=1e6, ticks=2**40, rate_hz=499.9, skipped=1, received=2,
-        sent=3, refused=4, saturated=5, latency_us=LATENCY, notes=["SCHED_FIFO: Operation not permitted"],
-        faults=[FAULT],
+        sent=3, refused=4, saturated=5, latency_us=LATENCY, latency_counts=COUNTS, trips={TripCause.OPERATOR: 2},
+        notes=["SCHED_FIFO: Operation not permitted"], faults=[FAULT],
     ),
+    COUNTS,
     FAULT,
     models.Telemetry(
         session="5f0c", tick=7, counter=15, attitude_error=(0.1, -0.2, 1e-17), rate_error=(0.0, 1 / 3, -2.0),

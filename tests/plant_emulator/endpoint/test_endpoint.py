@@ -211,3 +211,4 @@ def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: Veh
     end.stop(TripCause.DUPLICATE, "two plants")
     end.stop()
     assert (end.trip, [notice.kind for notice in end.notices]) == (TripCause.DUPLICATE, ["tripped", "tripped"])
+    assert end.trips == {TripCause.OPERATOR: 1, TripCause.DUPLICATE: 1}

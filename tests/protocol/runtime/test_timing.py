@@ -7,7 +7,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, Throttle, TickGrid
+from aeroloop.protocol.messages.models import LATENCY_BOUNDS_US
+from aeroloop.protocol.runtime.timing import (
+    Histogram,
+    LatencyHistogram,
+    LoopTiming,
+    RollingHistogram,
+    Throttle,
+    TickGrid,
+)
 from tests.support.clock import FakeClock
 
 START = 123_456_789_012_345
@@ -100,6 +108,17 @@ def test_a_percentile_is_within_half_a_bin_and_the_maximum_exact(durations_ns: l
     summary = histogram.summary()
     assert summary
     assert summary.count == len(durations_ns)
+
+
+@given(st.lists(st.integers(0, 200_000_000) | st.sampled_from([1000 * bound for bound in LATENCY_BOUNDS_US])))
+def test_latencies_are_counted_up_to_each_bound_and_summed(latencies_ns: list[int]) -> None:
+    histogram = LatencyHistogram()
+    for latency_ns in latencies_ns:
+        histogram.add(latency_ns)
+    report = histogram.report()
+    expected = [sum(each <= 1000 * bound for each in latencies_ns) for bound in LATENCY_BOUNDS_US]
+    assert report.counts == [*expected, len(latencies_ns)]
+    assert report.sum_us == pytest.approx(sum(latencies_ns) * 1e-3)
 
 
 def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_seconds_old() -> None:

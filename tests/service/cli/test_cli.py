@@ -70,6 +70,7 @@ def test_what_cannot_be_done_exits_with_1_and_is_named(capfd: pytest.CaptureFixt
             (("log", "review", f"{tmp_path}/file"), f"{tmp_path}/file"),
             (("log", "review", f"{tmp_path}/none.mcap"), "none.mcap"),
             (("recorder", "--log", f"{tmp_path}/file/a.mcap", *alone), "a.mcap"),
+            (("op", "metrics", "--port", endpoint.rpartition(":")[2], *alone), endpoint.removeprefix("tcp/")),
             (("recorder", "--log", str(tmp_path), *alone, "--set", f'network.listen=["{endpoint}"]'), endpoint),
         ):
             code, line = refusal(capfd, *words)
