@@ -19,8 +19,8 @@ from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign, pe
 from aeroloop.service.review.report import Line, Panel
 from aeroloop.service.review.theorem import TheoremCheck
 
-MAX_POINTS: Final = 180_000
-"""Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
+MAX_POINTS: Final = 90_000
+"""Points of a line. While a session has no more ticks (three minutes at 500 Hz), every tick is drawn."""
 
 DESIRED: Final = ("desired", "bound")  # beginnings of the names of lines that a run should follow, or stay below
 

@@ -52,7 +52,8 @@ def made_report(
     panels = [
         *(
             Panel("attitude", "Figure C.7: Attitude with quantization", label, "1",
-                  [Line("measured", measured), Line("desired", desired, desired=True)])
+                  [Line("measured", np.cos(time) if label == "η" else measured),
+                   Line("desired", desired, desired=True)])
             for label in ("η", "ε₁", "ε₂", "ε₃")
         ),
         Panel("error", "Figure C.9: Attitude error with quantization", "ε̃₁", "1",

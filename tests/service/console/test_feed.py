@@ -9,6 +9,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.service.config import load
 from aeroloop.service.console.feed import Feed, panels_of
+from aeroloop.service.logs.session import Array
 from aeroloop.service.logs.ticks import euler_deg
 from aeroloop.service.review.review import read
 from tests.support.made_log import START_NS, VEHICLE, description, made, write
@@ -17,8 +18,8 @@ TICKS = 1000
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Feed, dict[str, np.ndarray], np.ndarray]:
-    """A loop as a page is given it, and as its log has it: time and columns by name, and times."""
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Feed, dict[str, Array]]:
+    """A loop as a page is given it, and columns of its log by name."""
     settings = load()
     messages, feed = made(settings, TICKS), Feed()
     for role in ("plant", "controller"):
@@ -27,15 +28,15 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Feed, dict[str, np.n
     for message in messages:
         feed.take(message.key, message.payload, (message.at_ns - START_NS) * 1e-9, 0.0)
     log = read(write(tmp_path_factory.mktemp("feed") / "a.mcap", settings, messages))
-    k, columns = log.ticks.k, {}
+    columns = dict[str, Array]()
     for name, values in (("roll", 0), ("pitch", 1), ("yaw", 2)):
         columns[name] = euler_deg(log.ticks.attitude)[:, values]
-    columns |= {"u₂": log.ticks.voltages[:, 0], "latency": log.ticks.latency_ns * 1e-6, "k": k}
-    return feed, columns, k * settings.loop.period
+    columns |= {"u₂": log.ticks.voltages[:, 0], "latency": log.ticks.latency_ns * 1e-6}
+    return feed, columns
 
 
-def test_rows_are_those_of_the_log_at_fifty_a_second(both: tuple[Feed, dict[str, np.ndarray], np.ndarray]) -> None:
-    feed, logged, _ = both
+def test_rows_are_those_of_the_log_at_fifty_a_second(both: tuple[Feed, dict[str, Array]]) -> None:
+    feed, logged = both
     vehicle, block = feed.vehicles[VEHICLE], feed.block(VEHICLE, 0, 0, "")
     rows = np.array([[np.nan if value is None else value for value in row] for row in block["rows"]])
     assert rows[:, 0] == pytest.approx(np.arange(0, TICKS, 10) * 0.002)
@@ -53,9 +54,9 @@ def test_rows_are_those_of_the_log_at_fifty_a_second(both: tuple[Feed, dict[str,
 
 
 def test_a_page_gets_what_it_lacks_once_and_of_a_new_session_all(
-    both: tuple[Feed, dict[str, np.ndarray], np.ndarray],
+    both: tuple[Feed, dict[str, Array]],
 ) -> None:
-    feed, *_ = both
+    feed, _ = both
     whole = feed.block(VEHICLE, 0, 0, "")
     assert [row[0] for row in feed.block(VEHICLE, 90, 0, "s1")["rows"]] == [row[0] for row in whole["rows"][90:]]
     assert feed.block(VEHICLE, whole["count"], whole["numbered"], "s1")["rows"] == []
