@@ -27,6 +27,7 @@ from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import LawError, initial_state, law_of
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.review.report import Findings, Line, Panel, Report
+from aeroloop.service.theorem.certificate import Certificate
 
 LAST_S: Final = 60.0
 """What of the columns is kept and shown."""
@@ -56,6 +57,8 @@ def panels_of(settings: Settings, radius: float | None) -> list[Panel]:
         found.append(panel("latency", "Loop latency", "latency", "ms", "latency"))
     with suppress(LawError):
         for name, values in initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)).items():
+            if name == "sign":  # of the equilibrium
+                continue
             title, symbol = name.replace("_", " ").capitalize(), {"damping_estimate": "θ̂"}.get(name, name)
             found += [panel(name, title, f"{symbol}{i + 1}", "1", "estimated") for i in range(len(values))]
     if radius is not None:
@@ -73,6 +76,7 @@ class Vehicle:
         self.telemetry: deque[Telemetry] = deque(maxlen=16)  # of the session, the newest last
         self.settings: Settings | None = None
         self.radius: float | None = None  # of ‖z‖, where it is proven
+        self.verdict = ""  # of the certificate
         self.columns: list[Column] = []
         self.session = ""
         self.rows: deque[list[float]] = deque(maxlen=round(LAST_S * ROWS_HZ))  # time, then a value a column
@@ -90,8 +94,12 @@ class Vehicle:
         source = self.described.get("controller", description)
         with suppress(ConfigError):
             self.settings = from_description(source.config)
-            certificate = (source.certificate or {}) if isinstance(self.settings.law, AdaptiveSettings) else {}
-            self.radius = certificate.get("pointwise_radius") if certificate.get("holds") else None
+            self.radius, self.verdict = None, ""
+            with suppress(ValidationError):  # none, or of another version
+                certificate = Certificate.model_validate(source.certificate)
+                self.radius, self.verdict = certificate.plant_radius, certificate.verdict
+                if not (certificate.holds and isinstance(self.settings.law, AdaptiveSettings)):
+                    self.radius = None
             panels = panels_of(self.settings, self.radius)
             self.columns = [(each.group, each.label, line.label) for each in panels for line in each.lines]
             self.generation += 1

@@ -118,6 +118,7 @@ class Console:
             html = rendered(
                 "console.html", [vehicle.report()], "console.js", live=True, vehicle=vehicle.name,
                 generation=vehicle.generation, columns=vehicle.columns, reads_only=self.reads_only,
+                verdict=vehicle.verdict,
             )  # fmt: skip
         return _answer(HTTPStatus.OK, html, "text/html; charset=utf-8")
 

@@ -60,7 +60,7 @@ function showStatuses() {
       const link = element("a", name, { href: `?${address}` });
       row.append(document.createElement("td"), ...[role, status?.state ?? "missing", digits(status && status.age_s + since, 1),
         digits(status?.rate_hz, 0), digits(status?.skipped, 0), status?.latency_us?.map((us) => us.toFixed(0)).join("/") ?? "–",
-        status?.cause ?? ""].map((text) => element("td", text)));
+        [status?.cause, ...(status?.faults ?? []), ...(status?.notes ?? [])].filter(Boolean).join("; ")].map((text) => element("td", text)));
       row.firstChild.append(link);
       row.className = !status || status.age_s + since > 3 ? "quiet" : /tripped|faulted/.test(status.state) ? "bad" : "";
       rows.push(row);

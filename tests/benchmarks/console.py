@@ -69,14 +69,12 @@ def main() -> None:
         pages = (0, PAGES)[(i + i // 2) % 2]  # a, b, b, a
         found[pages].append(trial(pages))
         print(pages, found[pages][-1], file=sys.stderr)
-    show([
-        {"pages": str(pages)}
-        | {
-            name: f"{median(one[name] for one in its):.0f} ({min(one[name] for one in its):.0f}…{max(one[name] for one in its):.0f})"
-            for name in its[0]
-        }
-        for pages, its in found.items()
-    ])  # fmt: skip
+    rows = []
+    for pages, its in found.items():
+        columns = {name: sorted(one[name] for one in its) for name in its[0]}
+        texts = {name: f"{median(values):.0f} ({values[0]:.0f}…{values[-1]:.0f})" for name, values in columns.items()}
+        rows.append({"pages": str(pages), **texts})
+    show(rows)
 
 
 if __name__ == "__main__":
