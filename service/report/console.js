@@ -26,6 +26,7 @@ function append(block) {
     session = block.session;
     instants.length = 0;
     for (const line of lines) line.y.length = 0;
+    eventLines = [];
   }
   for (const [time, ...values] of block.rows ?? []) {
     instants.push(time);
@@ -92,11 +93,17 @@ function showGains(gains) {
 }
 
 function showEvents(events) {
-  for (const { at, vehicle: name, role, kind, text } of events) {
+  for (const { at, vehicle: name, role, kind, text, tick, session: its } of events) {
+    const isGrave = /tripped|fault|lost|refused/.test(kind);
+    if (name === vehicle && its === session && tick !== null) {
+      eventLines.push({ type: "line", x0: tick * period, x1: tick * period, y0: 0, y1: 1, yref: "paper", layer: "below",
+        line: { color: colour(isGrave ? "bad" : "quiet"), width: 1.2, dash: isGrave ? "solid" : "dot" } });
+      eventLines = eventLines.slice(-40);
+    }
     const row = document.createElement("tr");
     row.append(...[new Date(at * 1000).toLocaleTimeString(), name, role, kind, text].map((each) => element("td", each)));
     row.lastChild.className = "text";
-    if (/tripped|fault|lost|refused/.test(kind)) row.children[3].className = "kind grave";
+    if (isGrave) row.children[3].className = "kind grave";
     happened.prepend(row);
   }
   while (happened.children.length > 200) happened.lastChild.remove();

@@ -13,6 +13,7 @@ let cursor = null; // time that 3-D and readings show [s]
 let round = 0; // of drawing everything
 let following = live; // whether what is shown moves on with what is received
 let preview = []; // traces of an approach that is only considered
+let eventLines = []; // shapes of events that came while the page was open
 
 const runTimes = times.map(() => []); // of each run [s]
 for (const { data } of Object.values(drawings)) for (const line of data) line.y = [];
@@ -112,6 +113,7 @@ function draw(plot, size = {}) {
   if (plot.dataset.name === "angles") traces.push(...preview);
   const view = { ...coloured(layout), ...size, dragmode: pointed && !live ? "zoom" : false };
   view.xaxis = { ...view.xaxis, range: [...shown] };
+  view.shapes = [...(layout.shapes ?? []), ...eventLines];
   Plotly.react(plot, traces, view, options);
   placeCursor(plot);
   if (!isFirst) return;
