@@ -88,8 +88,8 @@ class TickCounter:
     next. As the two clocks drift apart, the mark may move later by 2 % of the elapsed periods: twice the error of a
     clock that runs 1 % fast, so that it follows either clock and still recovers from a mark that is too early.
 
-    In lockstep no tick is ever skipped, and the counter alone gives the tick. `tick` is that of the last measurement
-    that was newer than all before it; −1 at a session's start.
+    In lockstep the counter alone gives the tick, and the last one's again is a repetition. `tick` is that of the last
+    measurement that was newer than all before it; −1 at a session's start.
     """
 
     DRIFT: Final = 50  # the mark may move later by one period in this many
@@ -107,6 +107,8 @@ class TickCounter:
 
         None if it is not newer than the last one.
         """
+        if self._lockstep and self.tick >= 0 and counter == self.tick % self._counters:
+            return None
         if self._origin_ns is None:
             tick = self.tick + 1 + (counter - self.tick - 1) % self._counters
             if not self._lockstep:

@@ -49,6 +49,16 @@ def test_a_frame_has_its_true_tick_however_it_was_held_up_and_whatever_the_clock
         assert ticks.tick == last
 
 
+@given(st.sampled_from([16, 256]), st.lists(st.integers(1, 15), max_size=60))
+def test_in_lockstep_the_counter_gives_the_tick_and_a_frame_again_is_none(counters: int, steps: list[int]) -> None:
+    ticks, tick = TickCounter(PERIOD_NS, counters, lockstep=True), -1
+    for step in steps:
+        tick += step
+        assert ticks.advance(tick % counters, 0) == tick
+        assert ticks.advance(tick % counters, 0) is None
+        assert ticks.tick == tick
+
+
 def test_how_late_a_frame_is_counts_from_the_fastest_ones() -> None:
     start, late = 10**15, 3_000_000
     ticks = TickCounter(PERIOD_NS, 256, lockstep=False)
