@@ -51,12 +51,18 @@ class Console:
     def __init__(
         self, network: NetworkSettings, address: str, port: int, tls: tuple[Path, Path] | None, vehicle: str | None
     ) -> None:
-        local = address == "localhost" or ip_address(address).is_loopback
+        local, context = _is_loopback(address), None
         if tls is None and not local:
             raise ConsoleError(
                 f"{address} is beyond this host, where the console speaks TLS only: give --tls CERTIFICATE KEY, or "
                 "forward a port by ssh"
             )
+        if tls is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            try:
+                context.load_cert_chain(*tls)
+            except (OSError, ssl.SSLError) as error:
+                raise ConsoleError(f"--tls {tls[0]} {tls[1]}: {error.strerror or error}") from None
         self._feed, self._vehicle, self._token = Feed(), vehicle, secrets.token_urlsafe(24)
         self._session = joined_session(network)
         here = self._session.__enter__()
@@ -66,10 +72,6 @@ class Console:
         keys = [topics.key(name, "*") for name in SHOWN if name != "description"]
         self._subscribers = [here.session.declare_subscriber(key, self._receive) for key in keys]
         self._descriptions = RecoveringSubscriber(here.session, topics.key("description", "*"))
-        context = None
-        if tls is not None:
-            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            context.load_cert_chain(*tls)
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # no line for each page
         try:
             self._server = serve(
@@ -183,6 +185,17 @@ class Console:
             answer |= {"failed": str(error)}
         with suppress(ConnectionClosed, OSError):
             socket.send(json.dumps(answer))
+
+
+def _is_loopback(address: str) -> bool:
+    """Whether an address to listen on is this host's alone. Raises ConsoleError for every address at once."""
+    try:
+        found = ip_address(address)
+    except ValueError:  # a host's name
+        return address == "localhost"
+    if found.is_unspecified:
+        raise ConsoleError(f"{address} is every address: give --address the one that browsers use, as it is checked")
+    return found.is_loopback
 
 
 def _shown(status: Status) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -175,6 +176,15 @@ def test_a_slow_page_gets_the_newest_block_and_delays_no_other(hil: Hil) -> None
             assert len(block["rows"]) == block["count"] - before
 
 
-def test_beyond_this_host_there_is_tls_or_nothing() -> None:
-    with pytest.raises(ConsoleError, match="is beyond this host, where the console speaks TLS only"):
-        Console(load().network, "192.0.2.1", 0, None, None)
+@pytest.mark.parametrize(
+    ("address", "tls", "line"),
+    [
+        ("192.0.2.1", None, "is beyond this host, where the console speaks TLS only"),
+        ("a-host.example", None, "is beyond this host, where the console speaks TLS only"),
+        ("0.0.0.0", (Path("no.pem"), Path("no.key")), "is every address"),  # noqa: S104  # it is refused
+        ("192.0.2.1", (Path("no.pem"), Path("no.key")), "--tls no.pem no.key: No such file or directory"),
+    ],
+)
+def test_beyond_this_host_there_is_tls_or_nothing(address: str, tls: tuple[Path, Path] | None, line: str) -> None:
+    with pytest.raises(ConsoleError, match=line):
+        Console(load().network, address, 0, tls, None)
