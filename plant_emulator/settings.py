@@ -7,7 +7,8 @@ from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.limits import LimitMonitor, LimitSettings
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, Faults
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.model.bodies import AeroSettings, Mechanism, RigidBodySettings, aero, rigid_body

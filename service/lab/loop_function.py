@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import casadi as ca
 import numpy as np
 
-from aeroloop.plant_emulator.endpoint.endpoint import LimitSettings
+from aeroloop.plant_emulator.endpoint.limits import LimitSettings
 from aeroloop.plant_emulator.model.emulated import (
     Sensors,
     WindSettings,

@@ -11,7 +11,8 @@ from math import cos, nan, radians, sin
 
 import pytest
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings, VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, VehicleClaim
+from aeroloop.plant_emulator.endpoint.limits import LimitMonitor, LimitSettings
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Grant, Refusal, SessionRecord
