@@ -1,4 +1,4 @@
-"""Limits of a plant by its own sensors: tilt, rate, time at full voltage, time without a valid value; beyond one it trips."""
+"""Limits of a plant, judged by its own sensors once a tick; beyond one it trips."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
 """Feed of the console: what is published of every vehicle, as the newest states and the last minute of columns.
 
 A client of the network that only subscribes. The plant's trace has every tick's measurement, voltages and latency, of
-which at most `ROWS_HZ` a second are kept; what the controller computes is held from its telemetry. Sans-I/O but for
-`subscribe`: a message is a key and bytes, and time is an argument.
+which at most `ROWS_HZ` a second are kept; what the controller computes is held from its telemetry. Sans-I/O: a message
+is a key and bytes, and time is an argument.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from math import degrees, nan, sqrt
@@ -18,13 +18,15 @@ from typing import Any, Final
 import numpy as np
 from pydantic import ValidationError
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry
 from aeroloop.protocol.messages.trace import NEVER, Batch, Outcome, Sent, read_batch
 from aeroloop.protocol.wire.attitude import IDENTITY, angle, received_quaternion, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import LawError, initial_state, law_of
+from aeroloop.service.control.laws.registry import initial_state, law_of
+from aeroloop.service.host.health import replaces
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.review.report import Findings, Line, Panel, Report
 from aeroloop.service.theorem.certificate import Certificate
@@ -55,7 +57,7 @@ def panels_of(settings: Settings, radius: float | None) -> list[Panel]:
     found = [*angles, panel("error_angle", "Attitude error, as an angle", "angle", "°", "measured"), *errors, *motors]
     if not settings.loop.lockstep:
         found.append(panel("latency", "Loop latency", "latency", "ms", "latency"))
-    with suppress(LawError):
+    with suppress(AeroloopError):  # a law of one's own may not be installed here
         for name, values in initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)).items():
             if name == "sign":  # of the equilibrium
                 continue
@@ -77,14 +79,14 @@ class Vehicle:
         self.settings: Settings | None = None
         self.radius: float | None = None  # of ‖z‖, where it is proven
         self.verdict = ""  # of the certificate
-        self.columns: list[Column] = []
+        self.panels: list[Panel] = []
         self.session = ""
         self.rows: deque[list[float]] = deque(maxlen=round(LAST_S * ROWS_HZ))  # time, then a value a column
         self.count = 0  # rows of the session so far, so that a page knows which it lacks
         self.generation = 0  # of the description; a page with another one is loaded anew
         self._sent_us: deque[tuple[int, int]] = deque(maxlen=256)  # session tick, and when its measurement was sent
         self._attitude = IDENTITY
-        self._measured: list[float] = [nan] * 7
+        self._level: Callable[[float], float] = float  # of an attitude's code
 
     def describe(self, description: Description) -> None:
         """Take a role's description; of the ends it says how frames are read and what is drawn."""
@@ -94,30 +96,34 @@ class Vehicle:
         source = self.described.get("controller", description)
         with suppress(ConfigError):
             self.settings = from_description(source.config)
+            self._level = self.settings.wire.attitude.quantizer().level
             self.radius, self.verdict = None, ""
             with suppress(ValidationError):  # none, or of another version
                 certificate = Certificate.model_validate(source.certificate)
                 self.radius, self.verdict = certificate.plant_radius, certificate.verdict
                 if not (certificate.holds and isinstance(self.settings.law, AdaptiveSettings)):
                     self.radius = None
-            panels = panels_of(self.settings, self.radius)
-            self.columns = [(each.group, each.label, line.label) for each in panels for line in each.lines]
+            self.panels = panels_of(self.settings, self.radius)
             self.generation += 1
             self.rows.clear()
 
+    @property
+    def columns(self) -> list[Column]:
+        """What the values of a row after its time are."""
+        return [(each.group, each.label, line.label) for each in self.panels for line in each.lines]
+
     def report(self) -> Report:
         """A run without any tick, for the page."""
-        settings = self.settings
         findings = Findings.model_construct(marks=[], faults=[], gaps=[])
-        panels = panels_of(settings, self.radius) if settings else []
-        return Report(self.name, findings, np.empty(0), panels, 1, settings.description() if settings else {})
+        configuration = self.settings.description() if self.settings else {}
+        return Report(self.name, findings, np.empty(0), self.panels, 1, configuration)
 
     def add(self, batch: Batch) -> None:
         """Add rows of the plant's trace."""
         settings, columns = self.settings, batch.columns
         if settings is None or batch.header.end != "plant" or not batch.header.session or not batch.header.rows:
             return
-        if batch.header.row_dtype.itemsize == 0 or batch.header.measurement_bytes != settings.wire.measurement.size:
+        if batch.header.measurement_bytes != settings.wire.measurement.size:
             return
         if batch.header.session != self.session:
             self.session, self.count = batch.header.session, 0
@@ -138,7 +144,7 @@ class Vehicle:
         """Take the attitude of a measurement."""
         if (read := settings.wire.measurement.unpack(frame)) is None:
             return
-        x, y, z = map(settings.wire.attitude.quantizer().level, read[1][:3])
+        x, y, z = map(self._level, read[1][:3])
         if x == x and y == y and z == z:
             self._attitude = received_quaternion(x, y, z, self._attitude)
 
@@ -170,7 +176,8 @@ class Vehicle:
             **(known.state if known else {}),
         }
         parts = {group: iter(numbers) for group, numbers in values.items()}
-        return [tick * settings.loop.period, *(next(parts.get(group, iter(())), nan) for group, *_ in self.columns)]
+        groups = (each.group for each in self.panels for _ in each.lines)
+        return [tick * settings.loop.period, *(next(parts.get(group, iter(())), nan) for group in groups)]
 
 
 def _angles(q: Sequence[float]) -> tuple[float, ...]:
@@ -207,7 +214,10 @@ class Feed:
                 case "description":
                     vehicle.describe(Description.model_validate_json(payload))
                 case "status":
-                    vehicle.statuses[address.role or ""] = now_s, Status.model_validate_json(payload)
+                    status, role = Status.model_validate_json(payload), address.role or ""
+                    at, last = vehicle.statuses.get(role, (now_s, status))
+                    if replaces(status, last, now_s - at):
+                        vehicle.statuses[role] = now_s, status
                 case "telemetry":
                     vehicle.telemetry.append(Telemetry.model_validate_json(payload))
                 case "trace":
@@ -231,7 +241,7 @@ class Feed:
         return Gathered({name: roles for name, roles in statuses.items() if roles}, [])
 
     def block(self, name: str, rows_after: int, events_after: int, session: str) -> dict[str, Any]:
-        """Rows and events that a page lacks: of rows those that are still kept, of a new session all."""
+        """Rows and events that a page lacks: of rows those that are still kept, of a new session all; NaN: unknown."""
         events = [event for number, event in self.events if number > events_after]
         found: dict[str, Any] = {"events": events, "numbered": self._numbered}
         if (vehicle := self.vehicles.get(name)) is not None:
@@ -239,5 +249,5 @@ class Feed:
             kept = len(vehicle.rows)
             rows = list(islice(vehicle.rows, max(0, kept - lacks), kept))
             found |= {"session": vehicle.session, "count": vehicle.count, "generation": vehicle.generation}
-            found["rows"] = [[None if x != x else round(x, 6) for x in row] for row in rows]
+            found["rows"] = [[round(x, 6) for x in row] for row in rows]
         return found

@@ -21,6 +21,7 @@ from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
 import zenoh
+from pydantic_core import to_json
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -109,7 +110,7 @@ class Console:
         origin = request.headers.get("Origin")
         if request.headers.get("Host", "") not in self._hosts or origin not in (None, *self._origins):
             return _answer(HTTPStatus.FORBIDDEN, "a request of another host or origin\n")
-        if not secrets.compare_digest(given, self._token):
+        if not secrets.compare_digest(given.encode(), self._token.encode()):
             return _answer(HTTPStatus.UNAUTHORIZED, "the address lacks its token: `aeroloop op console` prints it\n")
         if path.path == "/socket":
             return None if origin is not None else _answer(HTTPStatus.FORBIDDEN, "a socket without an origin\n")
@@ -117,21 +118,19 @@ class Console:
             return _answer(HTTPStatus.NOT_FOUND, "nothing is here\n")
         vehicle = self._named(parse_qs(path.query).get("vehicle", [""])[0])
         with self._feed.lock:
-            html = rendered(
-                "console.html", [vehicle.report()], "console.js", live=True, vehicle=vehicle.name,
-                generation=vehicle.generation, columns=vehicle.columns, reads_only=self.reads_only,
-                verdict=vehicle.verdict,
-            )  # fmt: skip
+            known = {"generation": vehicle.generation, "columns": vehicle.columns, "verdict": vehicle.verdict}
+            report = vehicle.report()
+        names = {**known, "vehicle": vehicle.name, "reads_only": self.reads_only}
+        html = rendered("console.html", [report], "console.js", live=True, **names)
         return _answer(HTTPStatus.OK, html, "text/html; charset=utf-8")
 
     def _named(self, name: str) -> Vehicle:
         """The vehicle asked for, else the configured one, else the first with a plant or a controller."""
         with self._feed.lock:
             known = self._feed.vehicles
-            first = next(
-                (each for each, its in sorted(known.items()) if {"plant", "controller"} & its.statuses.keys()), ""
-            )
-            return known.get(name or self._vehicle or first) or Vehicle(name or self._vehicle or first or "aero")
+            ends = (each for each, its in sorted(known.items()) if {"plant", "controller"} & its.statuses.keys())
+            wanted = name or self._vehicle or next(ends, "aero")
+            return known.get(wanted) or Vehicle(wanted)
 
     # ── a page's socket ──
 
@@ -170,7 +169,7 @@ class Console:
                 }
                 wrong = [{"vehicle": one.vehicle, "role": one.role, "text": one.text} for one in troubles(found)]
                 shown.clear()
-                socket.send(json.dumps({"type": "block", "vehicles": statuses, "troubles": wrong, **block}))
+                _send(socket, {"type": "block", "vehicles": statuses, "troubles": wrong, **block})
                 time.sleep(BLOCK_S)
                 shown.wait()
 
@@ -184,7 +183,12 @@ class Console:
         except (AeroloopError, ValueError, KeyError, TypeError, IndexError) as error:
             answer |= {"failed": str(error)}
         with suppress(ConnectionClosed, OSError):
-            socket.send(json.dumps(answer))
+            _send(socket, answer)
+
+
+def _send(socket: ServerConnection, message: dict[str, Any]) -> None:
+    """Send a message as JSON, which has no NaN and no ∞: they are null."""
+    socket.send(to_json(message, inf_nan_mode="null"), text=True)
 
 
 def _is_loopback(address: str) -> bool:

@@ -17,6 +17,14 @@ NEEDED: Final = ("controller", "plant")
 """Roles that every vehicle needs; a recorder may be absent, unless it was there or is required."""
 
 
+def replaces(status: Status, last: Status, age_s: float) -> bool:
+    """Whether a status takes the place of the `last` of its vehicle and role, received `age_s` before.
+
+    Of several controllers of a vehicle the one with the session counts, else the first.
+    """
+    return status.role != "controller" or status.process == last.process or bool(status.session) or age_s > SILENT_S
+
+
 class Trouble(NamedTuple):
     """Something that is wrong, in one line; vehicle and role are None of a process that does not answer."""
 

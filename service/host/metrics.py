@@ -28,7 +28,7 @@ from aeroloop.protocol.messages.states import NOT_RECORDING, RECORDING, STOPPED,
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle
-from aeroloop.service.host.health import NEEDED, SILENT_S
+from aeroloop.service.host.health import NEEDED, SILENT_S, replaces
 
 _LABELS: Final = ("vehicle", "role")
 _STATES: Final[dict[str, Iterable[str]]] = {
@@ -51,10 +51,7 @@ class Exporter(Collector):
         self._telemetry: dict[str, tuple[float, Telemetry]] = {}
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Take in a message; drops what is no status or telemetry.
-
-        Of several controllers of a vehicle, it takes the statuses of the one with the session, else of the first.
-        """
+        """Take in a message; drops what is no status or telemetry."""
         if (address := topics.read_key(key)) is None:
             return
         now, vehicle = self._clock(), address.vehicle
@@ -64,8 +61,7 @@ class Exporter(Collector):
             elif address.topic.name == "status" and address.role is not None:
                 status = Status.decode(payload, extra="ignore")
                 received, last = self._statuses.get((vehicle, address.role), (now, status))
-                own = address.role != "controller" or status.process == last.process
-                if own or status.session or now - received > SILENT_S:
+                if replaces(status, last, now - received):
                     self._statuses[vehicle, address.role] = now, status
 
     def collect(self) -> Iterator[Metric]:

@@ -123,6 +123,7 @@ def test_another_origin_another_host_and_a_wrong_token_get_nothing(hil: Hil) -> 
         place, query = urlsplit(address).netloc, urlsplit(address).query
         assert status_of(address, f"/?{query}") == 200
         assert status_of(address, "/") == 401
+        assert status_of(address, "/?token=%C3%A9") == 401
         assert status_of(address, f"/?{query[:-1]}") == 401
         assert status_of(address, f"/?{query}", Host="evil.example") == 403
         assert status_of(address, f"/?{query}", Origin="http://evil.example") == 403

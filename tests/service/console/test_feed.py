@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.service.config import load
 from aeroloop.service.console.feed import Feed, panels_of
 from aeroloop.service.logs.session import Array
@@ -38,7 +38,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Feed, dict[str, Arra
 def test_rows_are_those_of_the_log_at_fifty_a_second(both: tuple[Feed, dict[str, Array]]) -> None:
     feed, logged = both
     vehicle, block = feed.vehicles[VEHICLE], feed.block(VEHICLE, 0, 0, "")
-    rows = np.array([[np.nan if value is None else value for value in row] for row in block["rows"]])
+    rows = np.array(block["rows"])
     assert rows[:, 0] == pytest.approx(np.arange(0, TICKS, 10) * 0.002)
     assert block["count"] == len(rows) == 100
     at = {(group, panel, quantity): i + 1 for i, (group, panel, quantity) in enumerate(vehicle.columns)}
@@ -79,3 +79,19 @@ def test_a_bound_is_drawn_only_where_it_is_proven() -> None:
         "bound",
     ]
     assert "latency" not in {panel.group for panel in panels_of(load(overrides=["loop.lockstep=true"]), None)}
+
+
+def test_of_several_controllers_the_one_with_the_session_is_shown() -> None:
+    feed, key = Feed(), topics.key("status", VEHICLE, role="controller")
+    spare = Status(role="controller", state="searching", process="spare", uptime_s=1, ticks=0, rate_hz=0, skipped=0)
+    own = spare.model_copy(update={"state": "running", "process": "own", "session": "s1"})
+    for now_s, status, shown in ((0.0, spare, "spare"), (0.1, own, "own"), (1.0, spare, "own"), (4.2, spare, "spare")):
+        feed.take(key, status.encode(), now_s, 0.0)
+        assert feed.gathered(now_s).statuses[VEHICLE]["controller"].process == shown
+
+
+def test_a_law_that_is_not_installed_here_costs_its_state_alone() -> None:
+    feed, role = Feed(), "controller"
+    settings = load(overrides=["law.kind=not_installed_here:Law"])
+    feed.take(topics.key("description", VEHICLE, role=role), description(settings, role).encode(), 0.0, 0.0)
+    assert {group for group, *_ in feed.vehicles[VEHICLE].columns} >= {"angles", "input", "latency"}
