@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import degrees, radians
+from math import degrees
 from typing import Any
 
 import numpy as np
@@ -62,8 +62,7 @@ class Verbs:
             telemetry, settings = (list(known.telemetry)[-1:], known.settings) if known else ([], None)
         if not telemetry or settings is None:
             raise VerbError(f"nothing is known of where {vehicle} is: no controller drives it")
-        own, target = settings.controller, Trajectory.of(Hold(attitude=attitude))
-        limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=settings.wire.actuators > 2)
+        target, limits = Trajectory.of(Hold(attitude=attitude)), Limits.of(settings.controller, settings.wire.actuators)
         target.check(limits)
         roll, pitch, yaw = map(degrees, to_euler(telemetry[0].desired))
         here = at_rest((roll, pitch, yaw + 360 * round((attitude[2] - yaw) / 360)))

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
 from itertools import product as combinations
-from math import asin, degrees, lcm, pi
+from math import asin, degrees, lcm, pi, radians
 from typing import Final, NamedTuple
 
 import casadi as ca
@@ -24,6 +24,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.wire.attitude import Vector, conjugate, from_euler, product
 from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.settings import ControllerSettings
 
 Floats = NDArray[np.float64]
 
@@ -48,6 +49,11 @@ class Limits(NamedTuple):
     rate: float  # largest angular velocity [rad/s]
     tilt: float  # largest angle between the body's z axis and the vertical [rad]
     rolls: bool  # whether the vehicle can roll; a 2-DOF bench cannot
+
+    @classmethod
+    def of(cls, own: ControllerSettings, actuators: int) -> Limits:
+        """The limits of a controller, for a vehicle with so many actuators."""
+        return cls(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=actuators > 2)
 
 
 class Angles(NamedTuple):

@@ -8,7 +8,7 @@ with is decided by `controller.after_restart`; the plant gets a record, for the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import degrees, pi, radians
+from math import degrees, pi
 from typing import Any, Final
 
 from zenoh.handlers import RingChannel
@@ -56,8 +56,7 @@ class OperatorChanges:
         own, reference = settings.controller, settings.reference
         self._role, self._law, self._trace, self._why_none = role, settings.law, trace, why_none
         self._configured, self._after_restart = reference, own.after_restart
-        rolls = settings.wire.actuators > 2
-        self._limits = Limits(own.max_reference_rate, radians(own.max_reference_tilt_deg), rolls=rolls)
+        self._limits = Limits.of(own, settings.wire.actuators)
         self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
         self._setpoint_s = 0.0  # when the stream last had a set-point, or began; 0 once its silence was an event
         self.refused = 0  # set-points so far, malformed or beyond the limits

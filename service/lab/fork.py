@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,6 +38,7 @@ from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.lockstep import LockstepLog, LockstepLoop
 from aeroloop.service.logs.frames import Direction
+from aeroloop.service.logs.outputs import check_output, writing_into
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
 from aeroloop.service.logs.session import Integers, Session
@@ -114,8 +115,9 @@ def fork(
 
     Raises:
         ForkError: It cannot be forked so.
-        AeroloopError: The log cannot be read, or an override or a fault is wrong.
+        AeroloopError: The log cannot be read, the new one cannot be written, or an override or a fault is wrong.
     """
+    check_output(log, paths)
     report = progress or (lambda _: None)
     recording = Recording(paths, lambda share: report(share / 2))
     which = recording.choose(session, vehicle)
@@ -135,16 +137,29 @@ def fork(
     if differed is not None:
         where = f"the plant, computed again, differs from the log from tick {differed.session_tick} on"
     with ExitStack() as stack:
-        out = log or Path(stack.enter_context(TemporaryDirectory())) / "fork.mcap"
-        begun = _begin_log(out, recording, recorded, its)
+        if log is None:
+            out = Path(stack.enter_context(TemporaryDirectory())) / "fork.mcap"
+        else:
+            out = stack.enter_context(writing_into(log.parent, paths)) / log.name
+        begun = stack.enter_context(closing(_begin_log(out, recording, recorded, its)))
         ended = _run(begun, its, plant, later, until, lambda share: report(REPLAYED + 0.3 * share))
-        forked, found = read(out), Recording([out]).session(which)
+        forked, found = _of(read(out), log), Recording([out]).session(which)
         end_s = (until + 0.5) * settings.loop.period
         known = read(*paths, session="/".join(which), since_s=tick * period, until_s=end_s)
     same_wire = (recorded.settings.loop, recorded.settings.wire) == (settings.loop, settings.wire)
     parts, compared, network = _parting(recorded, found, tick) if same_wire else (None, 0, None)
     report(1.0)
     return Fork(tick, tick * period, [*overrides, *faults], parts, compared, network, ended, where, log, forked, known)
+
+
+def _of(forked: Review, log: Path | None) -> Review:
+    """The review of a fork whose log was written elsewhere than where it stays, if it stays."""
+    name, why = str(log) if log else None, {} if log else {"log": "no new log was named"}
+    return replace(
+        forked,
+        figures=forked.figures.model_copy(update={"log": name, "reasons": forked.figures.reasons | why}),
+        findings=forked.findings.model_copy(update={"log": name, "reasons": forked.findings.reasons | why}),
+    )
 
 
 # ── both ends at the instant ──
@@ -266,11 +281,9 @@ class _Changes:
 
     def _approach(self, settings: Settings) -> Approach:
         """As `op track` approaches a reference. Raises FollowError if there is no approach."""
-        own, t = settings.controller, self.tick * settings.loop.period
-        limits = Limits(
-            own.max_reference_rate, np.radians(own.max_reference_tilt_deg), rolls=settings.wire.actuators > 2
-        )
-        return shortest(Trajectory.of(settings.reference), self.controller.motion.here(t), limits)
+        here = self.controller.motion.here(self.tick * settings.loop.period)
+        limits = Limits.of(settings.controller, settings.wire.actuators)
+        return shortest(Trajectory.of(settings.reference), here, limits)
 
     def before(self, k: int) -> None:
         """Apply what was changed up to tick k."""
@@ -322,7 +335,7 @@ def _run(
         log.plant(plant_row(endpoint, loop.measurement, arrival, 0), endpoint)
         if k % 256 == 0:
             report((k - tick) / (until + 1 - tick))
-    log.close(until)
+    log.finish(until)
     return ended
 
 

@@ -31,7 +31,6 @@ from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.session import SessionKey
 from aeroloop.service.recording.rolling import LogFile
 
@@ -89,20 +88,14 @@ class LockstepLoop:
 class LockstepLog:
     """A new log of one session from a tick on: rows of both ends, events, true states.
 
-    Tick `first` is at `begin_ns` on the one clock that everything has [ns since 1970]. Raises OutputError if the file
+    Tick `first` is at `begin_ns` on the one clock that everything has [ns since 1970]. Raises OSError if the file
     exists, or cannot be written.
     """
 
     def __init__(self, path: Path, settings: Settings, which: SessionKey, first: int, begin_ns: int) -> None:
         self._settings, self._first, self._begin_ns = settings, first, max(begin_ns, 1)
         self._vehicle, self._session = which
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = LogFile(path)
-        except FileExistsError:
-            raise OutputError(f"{path} exists already, and logs are never overwritten; name another file") from None
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from None
+        self._file = LogFile(path)
         self._writers = {end: TraceWriter(end, settings.wire, secrets.randbits(64)) for end in ENDS}
         rate_hz = settings.plant.truth_rate_hz
         self._truth_every = max(1, round(settings.loop.rate_hz / rate_hz)) if rate_hz else 0
@@ -145,12 +138,16 @@ class LockstepLog:
         event = Event(role=role, kind=kind, text=text, session=self._session, tick=k)
         self._add("event", role, event.encode(), k)
 
-    def close(self, k: int) -> None:
+    def finish(self, k: int) -> None:
         """Write what is left, up to tick k, and the index."""
         for end in ENDS:
             self._publish(end, k, final=True)
         self._file.commit()
         self._file.end()
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
 
     def _at_ns(self, k: int) -> int:
         return self._begin_ns + (k - self._first) * self._settings.loop.period_ns
@@ -165,4 +162,5 @@ class LockstepLog:
 
     def _add(self, topic: str, role: str, payload: bytes, k: int) -> None:
         at_ns = self._at_ns(k)
-        self._file.add(Delivery(topics.key(topic, self._vehicle, role=role), payload, 0, at_ns, None), at_ns)
+        if self._file.add(Delivery(topics.key(topic, self._vehicle, role=role), payload, 0, at_ns, None), at_ns):
+            self._file.commit()

@@ -11,7 +11,7 @@ import pytest
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import load, load_over
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.lab.fork import fork
+from aeroloop.service.lab.fork import REPLAYED, fork
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.session import Session
@@ -49,6 +49,7 @@ def test_a_fork_with_no_change_repeats_the_rest_of_a_lockstep_log(tmp_path: Path
     assert (found.parts, found.differed) == (None, None)
     assert_repeats(log, out, tick)
     assert found.figures.z_track == found.recorded.figures.z_track
+    assert (found.figures.log, found.forked.findings.log) == (str(out), str(out))
     again = replay([out], ends=["controller"])
     assert (again.differs, again.complete) == (False, True)
     assert not read(out).findings.missing
@@ -139,6 +140,18 @@ def test_a_body_changed_in_flight_goes_on_from_the_state_that_it_had(tmp_path: P
     assert plants[0].measure() == plants[1].measure()
 
 
+def test_an_interrupted_fork_leaves_no_log(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", TICKS)
+
+    def interrupt(share: float) -> None:
+        if share > REPLAYED:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fork([log], 50, log=tmp_path / "fork.mcap", progress=interrupt)
+    assert list(tmp_path.iterdir()) == [log]
+
+
 def test_what_cannot_be_forked_is_refused_in_one_line(tmp_path: Path) -> None:
     make_log(log := tmp_path / "run.mcap", 100)
     make_log(wheels := tmp_path / "wheels.mcap", 100, settings=lockstep(f"plant.kind={own_plants.__name__}:Pair"))
@@ -154,7 +167,7 @@ def test_what_cannot_be_forked_is_refused_in_one_line(tmp_path: Path) -> None:
         (partial(fork, [log], 100), "the session has ticks 0 to 99, up to 0.198 s, and none 100"),
         (partial(at_50, overrides=["law.C9=1"]), "unknown key law.C9"),
         (partial(at_50, faults=["foo"]), "it is written signal:kind"),
-        (partial(at_50, log=log), "exists already, and logs are never overwritten"),
+        (partial(at_50, log=log), "is an input of this command; name another file"),
         (partial(fork, [GOLDEN / "can.mcap"], 50), "only an emulated plant is computed again"),
     ):
         with pytest.raises(AeroloopError) as error:
