@@ -57,6 +57,8 @@ EngineOption = Annotated[
         help="Run on every core, or on the workers of a Dask cluster, which trusts its network: TLS, or a private one.",
     ),
 ]
+Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")]
+Address = Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
 Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown.")]

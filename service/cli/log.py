@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from math import inf
+from math import inf, isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
 from aeroloop.service.cli.common import (
+    Address,
     Config,
     Force,
     Json,
     NewLog,
     Overrides,
+    Port,
     fail,
     load_settings,
     report,
@@ -195,11 +197,14 @@ At = Annotated[str, typer.Option("--at", metavar="S|tick:K", help="The instant: 
 
 def _instant(text: str) -> int | float:
     """A tick, or a time on the law's clock [s], as `--at` gives it."""
-    word, number = text.replace(":", " ").split() if text.startswith("tick") else ("", text)
+    word, _, number = text.partition(":")
     try:
-        return int(number) if word else float(number)
+        at = int(number) if word == "tick" else float(text)
     except ValueError:
+        at = nan
+    if not isfinite(at):
         fail(f"--at is a time such as 12.34, or a tick such as tick:6170, not {text}", 2)
+    return at
 
 
 @group.command()
@@ -313,8 +318,8 @@ def recover(
 
 @group.command()
 def live(
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 8765,
-    address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
+    port: Port = 8765,
+    address: Address = "127.0.0.1",
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:

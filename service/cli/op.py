@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, report, show
+from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, show
 from aeroloop.service.cli.processes import run_alone
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ def status(
 
 @group.command()
 def console(
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 8766,
-    address: Annotated[str, typer.Option("--address", help="Address to listen on.")] = "127.0.0.1",
+    port: Port = 8766,
+    address: Address = "127.0.0.1",
     tls: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--tls", metavar="CERT KEY", help="PEM files of TLS, without which only this host is served."),
@@ -101,8 +101,8 @@ def console(
 
 @group.command()
 def metrics(
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 9464,
-    address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
+    port: Port = 9464,
+    address: Address = "127.0.0.1",
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:

@@ -20,6 +20,7 @@ from aeroloop.service.config import as_overrides
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.engine import local_processes
 from aeroloop.service.lab.fork import fork
+from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import ReviewError
 from aeroloop.service.logs.replay import AnotherWireError, replay
 from aeroloop.service.recording.rolling import parts
@@ -74,8 +75,8 @@ def check_logs(
 ) -> list[LogCheck]:
     """Check the logs of a corpus with `section.key=value` replaced, on all cores; if `accept`, accept what differs.
 
-    Raises ReviewError if there is no log, ConfigError if an override is wrong; a log that cannot be read is a result
-    with an error.
+    Raises ReviewError if there is no log, ConfigError if an override is wrong, OutputError if the file beside a log
+    cannot be written; a log that cannot be read is a result with an error.
     """
     logs = logs_of(paths)
     overrides = as_overrides(overrides) if isinstance(overrides, Mapping) else overrides
@@ -89,7 +90,8 @@ def check_logs(
     if accept:
         for one in checked:
             if not one.same and one.error is None:
-                _beside(one.log).write_text(json.dumps(_outcome(one), indent=1) + "\n", encoding="utf-8")
+                with writing(_beside(one.log), force=True) as part:
+                    part.write_text(json.dumps(_outcome(one), indent=1) + "\n", encoding="utf-8")
         checked = [one if one.error else one.model_copy(update={"accepted": not one.same}) for one in checked]
     return checked
 

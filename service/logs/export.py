@@ -87,6 +87,8 @@ def export(
         raise ExportError(
             "--session, --vehicle, --from and --to choose the rows of a table; --format mcap writes all of the log"
         )
+    if around is not None and (since_s, until_s) != (-inf, inf):
+        raise ExportError("--around chooses the time that is exported, and so do --from and --to: give one of them")
     log = paths[0].resolve() if paths[0].is_dir() else paths[0]  # "." has no name
     stem = log.name if log.is_dir() else log.stem
     out = out or log.with_name(stem + ("-decoded.mcap" if to == "mcap" else f".{to}"))

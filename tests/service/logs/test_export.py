@@ -108,6 +108,9 @@ def test_an_event_is_cut_out_of_a_log_with_the_seconds_beside_it(tmp_path: Path)
     with pytest.raises(ExportError, match="has no event 'nothing': name trip, fault, mark, or words of a mark"):
         export([log], "csv", tmp_path / "a.csv", around=("nothing", 1))
 
+    with pytest.raises(ExportError, match="and so do --from and --to: give one of them"):
+        export([log], "csv", tmp_path / "a.csv", around=("trip", 1), since_s=1.0)
+
     settings, at = load(), 1500
     messages = made(settings, 3000)
     for i, text in enumerate(("gust seen", "another")):
