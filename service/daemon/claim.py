@@ -99,9 +99,11 @@ class ClaimClient:
         if datagrams.linked:
             return datagrams.session
         for reply in role.zenoh.get(topics.key("status", role.vehicle, role="plant"), timeout=ANSWER_WAIT_S):
+            if reply.ok is None:  # Zenoh's for a query that timed out, which decides nothing
+                continue
             with suppress(MessageError):
-                status = Status.decode(reply.ok.payload.to_bytes(), extra="ignore") if reply.ok else None
-                if status is None or not status.datagrams:
+                status = Status.decode(reply.ok.payload.to_bytes(), extra="ignore")
+                if not status.datagrams:
                     return role.zenoh
                 linked = datagrams.connect(status.datagrams)
                 if linked is not False:

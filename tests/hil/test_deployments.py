@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from aeroloop.protocol.messages.models import Event
+from aeroloop.service.testing.hil_log import HilLog
 from tests.hil.test_clocks import STEP_S, python_clocks
 from tests.support.deployment import Deployment, Kind, Outcome
 from tests.support.namespaces import NoNamespacesError
@@ -75,6 +77,11 @@ def test_the_plant_rests_in_time_is_driven_again_and_the_log_lacks_nothing(
             happens(hosts)
             for outcome in hosts.finish():
                 assert_cheap(outcome)
+            claims = [event.text for _, event in HilLog(hosts.log_file).messages(Event) if event.kind == "claimed"]
+            by_datagrams = kind == "peers" and not overrides
+            assert all(
+                text.endswith("by datagrams") == by_datagrams for text in claims if text.startswith("controller")
+            )
             assert hosts.missed() == ({"controller": 0, "plant": 0}, 0)
     except NoNamespacesError as error:
         pytest.skip(f"no network namespaces here, or no nft or tc: {error}")

@@ -80,7 +80,9 @@ def test_prometheus_scrapes_a_running_loop_and_the_stop_that_ends_it(hil: Hil) -
             of_plant = r'\{role="plant",vehicle="aero"\}'
             hil.eventually("latencies", lambda: scraped(f"aeroloop_latency_seconds_count{of_plant}") > 250)
             assert scraped(f"aeroloop_latency_seconds_sum{of_plant}") > 0
-            assert 0 <= scraped(r"aeroloop_attitude_error_radians\{.*\}") < 0.5
+            error = r"aeroloop_attitude_error_radians\{.*\}"  # of telemetry, which begins after the first statuses
+            hil.eventually("telemetry", lambda: scraped(error) >= 0)
+            assert scraped(error) < 0.5
             assert scraped(r'aeroloop_state\{.*state="running".*\}') == 1
             stops = r"aeroloop_trips_total\{cause=\"operator's stop\".*\}"
             assert scraped(stops) == 0

@@ -69,7 +69,8 @@ class Plant:
 
     def get(self, key: str, **_: object) -> list[SimpleNamespace]:
         answers = [answer for topic, answer in self.answers.items() if f"/{topic}" in key]
-        return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers]
+        timed_out = [SimpleNamespace(ok=None)]  # Zenoh's reply for a query that is not answered in time
+        return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers] or timed_out
 
 
 def test_a_refusal_is_an_event_once_and_stays_known_until_a_grant(monkeypatch: pytest.MonkeyPatch) -> None:
