@@ -90,7 +90,11 @@ def product(p: ca.SX, q: ca.SX) -> ca.SX:
 
 def from_euler(angles: ca.SX) -> ca.SX:
     """Quaternion of [roll, pitch, yaw] in rad: yaw about z, then pitch about y, then roll about x. Shape (4, 1)."""
-    c, s = ca.cos(angles / 2), ca.sin(angles / 2)
+    return from_half_angles(ca.sin(angles / 2), ca.cos(angles / 2))
+
+
+def from_half_angles(s: ca.SX, c: ca.SX) -> ca.SX:
+    """The same, of the sines and cosines of half these angles. Shape (4, 1)."""
     about_x = ca.vertcat(c[0], s[0], 0, 0)
     about_y = ca.vertcat(c[1], 0, s[1], 0)
     about_z = ca.vertcat(c[2], 0, 0, s[2])

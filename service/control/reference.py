@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
-from aeroloop.protocol.wire.attitude import Vector, conjugate, from_euler, product
+from aeroloop.protocol.wire.attitude import Vector, conjugate, from_half_angles, product
+from aeroloop.protocol.wire.elementary import sine_cosine
+from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.settings import ControllerSettings
 
@@ -274,18 +276,31 @@ def reference_function() -> ca.Function:
     """
     t, start, quintic = ca.SX.sym("t"), ca.SX.sym("start"), ca.SX.sym("quintic", 3, POWERS)
     amplitude, frequency = ca.SX.sym("amplitude", 3), ca.SX.sym("frequency", 3)
-    tau = t - start
+    tau, *circular = ca.SX.sym("tau"), *(ca.SX.sym(name, 3) for name in ("s_wave", "c_wave", "s_half", "c_half"))
+    s_wave, c_wave, s_half, c_half = circular  # sines and cosines of the sinusoid's angles and of half the attitude's
     angles = ca.SX.zeros(3)
     for n in reversed(range(POWERS)):
         angles = angles * tau + quintic[:, n]
-    q_d = from_euler(angles + amplitude * ca.sin(frequency * tau))
-    q_d_dot = ca.jacobian(q_d, t)
-    omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
-    omega_d_dot = ca.jacobian(omega_d, t)
+    angles += amplitude * s_wave
+    waves, wave_rates = ca.vertcat(tau, s_wave, c_wave), ca.vertcat(1, frequency * c_wave, -frequency * s_wave)
+    half_rates = ca.jtimes(angles, waves, wave_rates) / 2
+    moving = ca.vertcat(waves, s_half, c_half)
+    rates = ca.vertcat(wave_rates, c_half * half_rates, -s_half * half_rates)
+    q_d = from_half_angles(s_half, c_half)
+    omega_d = 2 * product(ca.jtimes(q_d, moving, rates), conjugate(q_d))[1:4]  # (C.12), solved for ω_d
+    moved = [q_d, omega_d, ca.jtimes(omega_d, moving, rates)]
+
+    piece = [quintic, amplitude, frequency]
+    attitude = ca.Function("attitude", [tau, *piece, s_wave], [angles])
+    motion = ca.Function("motion", [tau, *piece, *circular], moved, {"cse": True})
     inputs = {"t": t, "start": start, "quintic": quintic, "amplitude": amplitude, "frequency": frequency}
-    outputs = {"q_d": q_d, "omega_d": omega_d, "omega_d_dot": omega_d_dot}
-    # The derivatives repeat sines and cosines: with "cse" 12 instead of 36, and the same numbers.
-    return ca.Function("reference", [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True})
+    with as_written():
+        since = t - start
+        wave = sine_cosine(frequency * since)
+        half = sine_cosine(attitude(since, *piece, wave[0]) / 2)
+        found = motion(since, *piece, *wave, *half)
+        names = ["q_d", "omega_d", "omega_d_dot"]
+        return ca.Function("reference", [*inputs.values()], [*found], [*inputs], names, {"cse": True})
 
 
 def desired(reference: Reference, period: float, ticks: int) -> Floats:

@@ -29,6 +29,7 @@ import casadi as ca
 from pydantic import Field
 
 from aeroloop.protocol.wire.attitude import S
+from aeroloop.protocol.wire.elementary import tanh
 from aeroloop.service.control.laws.baselines import DEFAULTS, VOLTAGE_LIMIT, TrackingSettings, feedforward, nearer
 from aeroloop.service.control.laws.interface import (
     Diagonal,
@@ -103,7 +104,7 @@ class AdaptiveTorque(ExpressionLaw[AdaptiveTorqueSettings]):
         z2 = omega_e + gains["C1"] * eps_e
         alpha_dot = -gains["C1"] / 2 * ((eta_e * ca.SX.eye(3) + S(eps_e)) @ omega_e)  # (C.46)
         omega_r = now.rate - z2
-        Phi_v, Phi_c = -omega_r, -ca.tanh(omega_r / p.friction_width)  # diagonals
+        Phi_v, Phi_c = -omega_r, -tanh(omega_r / p.friction_width)  # diagonals
 
         learned = state["torque_estimate"] + Phi_c * state["coulomb_estimate"]
         learned += Phi_v * (state["damping_estimate"] - ca.SX(p.damping_estimate))

@@ -29,6 +29,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat
 
 from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.elementary import tanh
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings
 from aeroloop.service.control.laws.interface import (
     Diagonal,
@@ -255,7 +256,7 @@ class Sliding(TrackingLaw[SlidingSettings]):
         eta_e, eps_e, omega_e = now.attitude_error[0], now.attitude_error[1:4], now.rate_error
         sigma = omega_e + slope * eps_e
         along = ca.SX(p.inertia) * slope / 2 * ((eta_e * ca.SX.eye(3) + S(eps_e)) @ omega_e)  # ε̃ moves by (C.17)
-        return -along - now.gains["strength"] * ca.tanh(sigma / ca.SX(p.layer)), {}
+        return -along - now.gains["strength"] * tanh(sigma / ca.SX(p.layer)), {}
 
 
 class LQRSettings(TrackingSettings):
