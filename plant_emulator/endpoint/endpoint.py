@@ -68,12 +68,13 @@ class Freshness:
     def __init__(self, counters: int, period_ns: int, watchdog_s: float) -> None:
         self._counters = counters
         watchdog_ns = round(watchdog_s * 1e9)
-        self._oldest = max(1, round(watchdog_ns / period_ns))  # age of a fresh command at the most [ticks]
-        self._watchdog_ns = self._oldest * period_ns
+        self.watchdog_ticks = max(1, round(watchdog_ns / period_ns))  # also the age of a fresh command at the most
+        self._watchdog_ns = self.watchdog_ticks * period_ns
         first_ns = _FIRST_COMMAND_NS
         if counters * period_ns >= 2 * watchdog_ns:
             first_ns = min(first_ns, (counters - 1) * period_ns)
-        self._first_ns = max(1, first_ns // period_ns) * period_ns
+        self.first_ticks = max(1, first_ns // period_ns)  # until the first command at the most
+        self._first_ns = self.first_ticks * period_ns
         self.reset()
 
     def reset(self) -> None:
@@ -91,7 +92,7 @@ class Freshness:
         age = (session_tick - echo) % self._counters
         if echo == self.echo or session_tick - age <= self.answered:
             return Outcome.REPEATED
-        if age > self._oldest:
+        if age > self.watchdog_ticks:
             return Outcome.STALE
         self.echo, self.answered = echo, session_tick - age
         self.since_ns, self._limit_ns = now_ns, self._watchdog_ns

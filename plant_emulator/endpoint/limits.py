@@ -25,7 +25,7 @@ class LimitMonitor:
 
     def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
         self._settings, self._period_ns, self._full = settings, period_ns, voltage_limit
-        self._least_upright = cos(radians(settings.max_tilt_deg))
+        self.least_upright = cos(radians(settings.max_tilt_deg))
         self.reset()
 
     def reset(self) -> None:
@@ -43,7 +43,7 @@ class LimitMonitor:
             return None
         self._invalid = 0
         upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
-        if upright < self._least_upright:
+        if upright < self.least_upright:
             tilt = degrees(acos(max(-1.0, upright)))
             reason = f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
             return TripCause.ENVELOPE, reason
