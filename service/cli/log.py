@@ -143,8 +143,12 @@ def _write_page(reports: Sequence[Report], out: Path, logs: Sequence[Path], forc
 def replay(
     logs: Logs,
     end: Annotated[
-        Literal["controller", "plant"] | None, typer.Option("--end", help="Only this end; both if left out.")
+        Literal["controller", "plant", "c"] | None,
+        typer.Option("--end", help="Only this end, c: the controller as `show c` exports it; both if left out."),
     ] = None,
+    machine: Annotated[
+        Literal["host", "aarch64", "cortex-m4"], typer.Option("--machine", help="With --end c: where it runs.")
+    ] = "host",
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
@@ -152,8 +156,15 @@ def replay(
     from aeroloop.service.logs.replay import replay
     from aeroloop.service.terminal.log_sheets import replay_sheets
 
+    answering = None
+    if end == "c":
+        from aeroloop.service.firmware.machines import InC
+
+        end, answering = "controller", InC(machine)
+    elif machine != "host":
+        fail("--machine is for --end c", 2)
     with working("replaying", json, 1) as update:
-        replayed = replay(logs, progress=update, ends=[end] if end else ENDS)
+        replayed = replay(logs, progress=update, ends=[end] if end else ENDS, answering=answering)
     show(replayed, json, replay_sheets)
     if replayed.differs or not replayed.complete:
         raise typer.Exit(1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aeroloop.service.cli.common import Config, Overrides, checked, fail, load_for_loop, load_settings
+from aeroloop.service.cli.common import Config, Force, Overrides, checked, fail, load_for_loop, load_settings
 
 if TYPE_CHECKING:
     from aeroloop.service.config import Settings
@@ -95,6 +95,25 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
     with checked():
         text = describe(settings.wire, settings.can.node, settings.loop.period_ns)
     typer.echo(text, nl=False)
+
+
+@group.command("c")
+def show_c(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to; made if need be.")],
+    force: Force = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Write the controller and a plant's node as C99 for firmware, with golden commands and a Makefile."""
+    settings = load_for_loop(config, overrides)
+
+    from aeroloop.service.firmware.export import export
+
+    if not force and folder.exists() and any(folder.iterdir()):
+        fail(f"{folder} is not empty; --force replaces files of these names", 2)
+    with checked():
+        files = export(settings, folder)
+    typer.echo(f"wrote {len(files)} files to {folder}; `make -C {folder} test` computes the golden commands there")
 
 
 @group.command()

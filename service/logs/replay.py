@@ -8,7 +8,7 @@ the log's plant does not respond to that, so it is no simulation: service/lab/fo
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Literal
@@ -22,6 +22,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
+from aeroloop.service.control.controller import Controller
 from aeroloop.service.logs.frames import Direction, differences
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, SessionKey, Unknown
@@ -119,11 +120,22 @@ class Replay(BaseModel, frozen=True):
         return not any(self.unseen.values())
 
 
+class Answering:
+    """How rows of a controller are answered again: by the controller itself. A subclass may compute them otherwise."""
+
+    made_by: type[Controller] = Controller
+
+    def answers(self, logged: LoggedController, progress: Progress | None) -> Iterable[bytes | None]:
+        """As `LoggedController.answers`."""
+        return logged.answers(progress)
+
+
 def replay(
     paths: Sequence[Path],
     overrides: Sequence[str] = (),
     progress: Progress | None = None,
     ends: Collection[End] = ENDS,
+    answering: Answering | None = None,
 ) -> Replay:
     """Replay every session of a run.
 
@@ -143,7 +155,7 @@ def replay(
     if "controller" in ends:
         for which in (which for which, extent in recording.extents.items() if extent.rows["controller"]):
             try:
-                sessions.append(_replay_session(recording, which, overrides, progress))
+                sessions.append(_replay_session(recording, which, overrides, progress, answering or Answering()))
             except AeroloopError as error:
                 if overrides:
                     raise
@@ -187,14 +199,14 @@ def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay 
 
 
 def _replay_session(
-    recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None
+    recording: Recording, which: SessionKey, overrides: Sequence[str], progress: Progress | None, answering: Answering
 ) -> SessionReplay:
     """Replay a session's controller. Raises AeroloopError if that cannot be."""
     settings = load_over(recording.settings(which), overrides)
     parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
     ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
     session = recording.session(which)
-    logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides)
+    logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides, made_by=answering.made_by)
     rows, wire = session.controller, settings.wire
     if wire.measurement.widths != session.settings.wire.measurement.widths:
         raise AnotherWireError("its measurements are frames of another wire, so no command can be computed from them")
@@ -204,7 +216,7 @@ def _replay_session(
         if progress is not None:
             progress(INDEXING + (1 - INDEXING) / 2 * done)
 
-    for answer in logged.answers(share):
+    for answer in answering.answers(logged, share):
         sent_as.append(Sent.NONE if answer is None else Sent.FRAME if answer else Sent.SILENT)
         frames += answer or bytes(wire.command.size)
 

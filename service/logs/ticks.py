@@ -87,7 +87,8 @@ class LoggedController:
     """The controller of a session, which answers its rows again, one after the other.
 
     With other `settings` than the session's, parts of the logged changes may be `ignored`. It `resumes` from the
-    recorded state where rows are missing. `state_before` is the law's state before the last row.
+    recorded state where rows are missing. `made_by` is the class of its controller. `state_before` is the law's state
+    before the last row.
     """
 
     def __init__(
@@ -97,9 +98,10 @@ class LoggedController:
         *,
         ignored: Collection[Literal["gains", "reference"]] = (),
         resumes: bool = True,
+        made_by: type[Controller] = Controller,
     ) -> None:
-        settings = settings or session.settings
-        self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self.settings = settings = settings or session.settings
+        self.controller = made_by(settings.wire, settings.law, settings.reference, settings.loop.period)
         self.state_before = np.array(self.controller.last_valid["state_next"])
         self._rows = session.controller
         self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
