@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -108,12 +108,30 @@ def show_c(
     settings = load_for_loop(config, overrides)
 
     from aeroloop.service.firmware.export import export
+    from aeroloop.service.logs.outputs import writing_into
 
-    if not force and folder.exists() and any(folder.iterdir()):
-        fail(f"{folder} is not empty; --force replaces files of these names", 2)
-    with checked():
-        files = export(settings, folder)
+    with checked(), writing_into(folder, force=force) as new:
+        files = export(settings, new)
     typer.echo(f"wrote {len(files)} files to {folder}; `make -C {folder} test` computes the golden commands there")
+
+
+@group.command()
+def fmu(
+    which: Annotated[Literal["aero", "law"], typer.Argument(help="The emulated plant, or the law.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.fmu", help="The new file.")],
+    force: Force = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Write the emulated plant, or the law between both quantizers, as an FMU for co-simulation (FMI 2.0)."""
+    settings = load_for_loop(config, overrides)
+
+    from aeroloop.service.firmware.fmu import write_fmu
+    from aeroloop.service.logs.outputs import writing
+
+    with checked(), writing(out, force=force) as new:
+        write_fmu(settings, which, new)
+    typer.echo(f"wrote {out}; it steps by {settings.loop.period:g} s")
 
 
 @group.command()

@@ -53,10 +53,10 @@ def export(settings: Settings, folder: Path) -> list[Path]:
         "golden.h": _golden_header(golden(settings)),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(SOURCES, folder, dirs_exist_ok=True)
+    copied = [Path(shutil.copy(source, folder)) for source in SOURCES.iterdir() if source.is_file()]
     for name, text in generated.items():
         (folder / name).write_text(text, encoding="ascii")
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+    return [*copied, *(folder / name for name in generated)]
 
 
 def expression_law(settings: Settings) -> ExpressionLaw[Any]:
@@ -92,11 +92,16 @@ def equations_files(settings: Settings) -> dict[str, str]:
     """`aero_names.h` and `aero_equations.c`, by name. Raises as `expression_law`."""
     law = expression_law(settings)
     function = equations(law)
-    generator = ca.CodeGenerator(f"{_EQUATIONS}.c", {"casadi_int": "long long int"})
-    generator.add(function)
+    return {"aero_names.h": _names_header(settings, law, function), f"{_EQUATIONS}.c": c_source(function)}
+
+
+def c_source(*functions: ca.Function) -> str:
+    """Functions as C."""
+    generator = ca.CodeGenerator("functions.c", {"casadi_int": "long long int"})
+    for function in functions:
+        generator.add(function)
     with TemporaryDirectory(prefix="aeroloop-") as folder:
-        source = Path(generator.generate(f"{folder}/")).read_text(encoding="ascii")
-    return {"aero_names.h": _names_header(settings, law, function), f"{_EQUATIONS}.c": source}
+        return Path(generator.generate(f"{folder}/")).read_text(encoding="ascii")
 
 
 def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Function) -> str:
@@ -105,7 +110,7 @@ def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Func
     described = {name: type(law.settings).model_fields[name].description or "" for name in gains}
     trajectory = Trajectory.of(settings.reference)
     pieces = ",".join(
-        f" \\\n    {{{start.hex()}, {_braced(quintic)}, {_braced(amplitude)}, {_braced(frequency)}}}"
+        f" \\\n    {{{start.hex()}, {braced(quintic)}, {braced(amplitude)}, {braced(frequency)}}}"
         for start, quintic, amplitude, frequency in zip(
             trajectory.starts.tolist(), *(part.tolist() for part in trajectory[1:]), strict=True
         )
@@ -114,11 +119,11 @@ def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Func
         f"/* Names of the law {_ascii(settings.law.kind)}, its configured gains and the configured reference. */",
         *_struct("aero_state", state, {name: f"[{unit}]" for name, unit in units.items()}),
         f"#define AERO_STATE_BYTES {8 * sum(map(len, state.values()))}U",
-        f"#define AERO_INITIAL_STATE {_braced([*state.values()] or [[0.0]])}",
+        f"#define AERO_INITIAL_STATE {braced([*state.values()] or [[0.0]])}",
         "",
         *_struct("aero_gains", gains, described),
         f"#define AERO_GAINS_BYTES {8 * sum(map(len, gains.values()))}U",
-        f"#define AERO_CONFIGURED_GAINS {_braced([*gains.values()] or [[0.0]])}",
+        f"#define AERO_CONFIGURED_GAINS {braced([*gains.values()] or [[0.0]])}",
         "",
         f"#define AERO_PERIOD_S {settings.loop.period.hex()} /* {settings.loop.period:.9g} s */",
         f"#define AERO_REFERENCE {{{pieces}}}",
@@ -130,7 +135,7 @@ def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Func
         f"#define AERO_SCRATCH_INDICES {max(1, function.sz_iw())}",
         f"#define AERO_SCRATCH {max(1, function.sz_w())}",
     ]
-    return _header("aero_names", lines)
+    return header("aero_names", lines)
 
 
 def _struct(name: str, members: Mapping[str, Sequence[float]], comments: Mapping[str, str]) -> Iterator[str]:
@@ -142,9 +147,9 @@ def _struct(name: str, members: Mapping[str, Sequence[float]], comments: Mapping
     yield f"}} {name};"
 
 
-def _braced(values: Any) -> str:
+def braced(values: Any) -> str:
     """Numbers, nested as they are, as an initializer that keeps every bit."""
-    return float(values).hex() if isinstance(values, int | float) else f"{{{', '.join(map(_braced, values))}}}"
+    return float(values).hex() if isinstance(values, int | float) else f"{{{', '.join(map(braced, values))}}}"
 
 
 # ── golden commands and versions ──
@@ -168,7 +173,7 @@ def _golden_header(controller: ScriptedController) -> str:
         *_bytes("golden_script", controller.script),
         *_bytes("golden_answers", controller.answers),
     ]
-    return _header("golden", lines)
+    return header("golden", lines)
 
 
 def _version_header(settings: Settings) -> str:
@@ -185,10 +190,11 @@ def _version_header(settings: Settings) -> str:
         "CERTIFICATE": promise(settings).verdict,
     }
     lines = [f'#define AERO_{name} "{_ascii(text)}"' for name, text in texts.items()]
-    return _header("aero_version", [f"#define AERO_PROTOCOL {PROTOCOL_VERSION}", *lines])
+    return header("aero_version", [f"#define AERO_PROTOCOL {PROTOCOL_VERSION}", *lines])
 
 
-def _header(name: str, lines: Sequence[str]) -> str:
+def header(name: str, lines: Sequence[str]) -> str:
+    """A header's text around these lines."""
     guard = f"{name.upper()}_H"
     top = "/* Generated by `aeroloop show c`: do not edit. */", f"#ifndef {guard}", f"#define {guard}", ""
     return "\n".join([*top, *lines, "", "#endif", ""])

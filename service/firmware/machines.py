@@ -44,7 +44,7 @@ MACHINES: Final[dict[str, Machine]] = {
     ),
 }
 """Processors by name. A Cortex-M4F has double precision in software only."""
-_BARE: Final = ("--specs=rdimon.specs", "-Tcortex_m/mps2.ld", "cortex_m/start.c")  # to link a program for no system
+_BARE: Final = ("--specs=rdimon.specs", "-Tcortex_m.ld", "cortex_m.c")  # to link a program for no system
 
 
 class Program:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ import pytest
 
 from aeroloop.service.config import load
 from aeroloop.service.firmware.export import ExportError, export
+from aeroloop.service.firmware.fmu import write_fmu
 from aeroloop.service.firmware.machines import MACHINES, InC, Program
+from aeroloop.service.lab.experiment import experiment
 from aeroloop.service.logs.replay import replay
 from tests.support.own_laws import PYTHON
 
@@ -74,3 +77,32 @@ def test_a_law_in_python_and_a_missing_compiler_are_one_clear_line(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ExportError, match=r"install gcc-arm-none-eabi .* make$"):
         Program(tmp_path / "c", "cortex-m4")
+
+
+def test_fmus_of_law_and_plant_give_the_voltages_of_the_experiment(tmp_path: Path) -> None:
+    """FMPy checks both files, and connects them; nothing is shared with the experiment but the sources."""
+    fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: it comes with aeroloop[fmi]")
+    validation, fmi = import_module("fmpy.validation"), import_module("fmpy.fmi2")
+    settings, ticks = load(), 1000
+    period, fmus = settings.loop.period, dict[str, Any]()
+    for which in ("aero", "law"):
+        write_fmu(settings, which, file := tmp_path / f"{which}.fmu")
+        assert validation.validate_fmu(str(file)) == []
+        described = fmpy.read_model_description(str(file))
+        folder = fmpy.extract(str(file), str(tmp_path / which))
+        fmus[which] = fmi.FMU2Slave(guid=described.guid, unzipDirectory=folder, modelIdentifier=which)
+        fmus[which].instantiate()
+        fmus[which].setupExperiment(startTime=0)
+        fmus[which].enterInitializationMode()
+        fmus[which].exitInitializationMode()
+    plant, law, voltages = fmus["aero"], fmus["law"], list[list[float]]()
+    inputs = [0, 1]  # u2, u3 of the plant; its loads are 2 and 3, and what it measures follows
+    for k in range(ticks):
+        law.setReal(range(7), plant.getReal(range(4, 11)))
+        law.doStep(k * period, period)
+        voltages.append(law.getReal([7, 8]))
+        plant.setReal(inputs, voltages[-1])
+        plant.doStep(k * period, period)
+    assert voltages == experiment(settings, ticks * period).course.voltages.tolist()
+    with pytest.raises(fmi.FMICallException):
+        plant.doStep(0.0, 2 * period)
