@@ -109,18 +109,20 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 
 def working(title: str, hidden: bool, total: float | None = None) -> AbstractContextManager[Callable[..., None]]:
     """A progress bar: `update(done, total)`; hidden where JSON is printed."""
-    from aeroloop.service.terminal.display import progress_bar
+    from aeroloop.service.terminal.show import progress_bar
 
     return progress_bar(title, total, hidden=hidden)
 
 
 def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdown: bool = False, keys: int = 1) -> None:
     """Print a result: all of it as JSON, or the tables that a function makes of it."""
+    from pydantic_core import to_json
+
+    from aeroloop.service.terminal import show as printer
+
     if json:
-        from pydantic_core import to_json
-
         typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
+    elif markdown:
+        typer.echo(printer.markdown(sheets(result)))
     else:
-        from aeroloop.service.terminal.show import show_all
-
-        show_all(sheets(result), "markdown" if markdown else "terminal", keys)
+        printer.show_all(sheets(result), keys)

@@ -24,7 +24,7 @@ from aeroloop.service.cli.common import (
     show,
     working,
 )
-from aeroloop.service.cli.processes import run_alone
+from aeroloop.service.cli.entry import run_alone
 
 if TYPE_CHECKING:
     from threading import Event
@@ -111,7 +111,7 @@ def compare(
         fail("log compare takes two logs or more", 2)
     from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.review.requirements import Limit, broken_limits
-    from aeroloop.service.review.review import Comparison, read_runs
+    from aeroloop.service.review.review import compared, read_runs
     from aeroloop.service.terminal.log_sheets import comparison_sheets
 
     limits = [Limit.parse(text) for text in require or []]
@@ -120,7 +120,7 @@ def compare(
         reports = read_runs(logs, limits, update)
     if html is not None:
         _write_page(reports, html, logs, force)
-    show(Comparison.of(reports), json, lambda _: comparison_sheets(reports))
+    show(compared(reports), json, lambda _: comparison_sheets(reports))
     if broken := [f"{run.name}: {line}" for run in reports for line in broken_limits(run.findings)]:
         fail("; ".join(broken), 1)
 
@@ -312,22 +312,6 @@ def fork(
 
 
 @group.command()
-def recover(
-    broken: Annotated[Path, typer.Argument(help="A log that was cut or damaged; it is not changed.")],
-    out: Annotated[Path, typer.Argument(help="The new file.")],
-    force: Force = False,
-    json: Json = False,
-) -> None:
-    """Copy what is whole of a broken log into a new one. Reports what was lost."""
-    from aeroloop.service.logs.copies import recover
-    from aeroloop.service.terminal.log_sheets import recovery_sheets
-
-    with working("recovering", json, 1) as update:
-        recovery = recover(broken, out, update, force=force)
-    show(recovery, json, recovery_sheets)
-
-
-@group.command()
 def live(
     port: Port = 8765,
     address: Address = "127.0.0.1",
@@ -357,9 +341,7 @@ def export(
     out: Annotated[
         Path | None, typer.Option("--out", help="The new file; the log's name with another suffix if left out.")
     ] = None,
-    session: Annotated[
-        str | None, typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.")
-    ] = None,
+    session: Session = None,
     vehicle: Vehicle = None,
     since_s: Since = -inf,
     until_s: Until = inf,
@@ -374,14 +356,22 @@ def export(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Write a log as a table with a row for each tick. With --format mcap: a log with every message decoded."""
-    from aeroloop.service.logs.export import export
+    """Write a log as a table with a row for each tick. With --format mcap: all that can be read of it, as one log."""
     from aeroloop.service.terminal.log_sheets import export_sheets
 
     _check_part(since_s, until_s)
+    if form == "mcap" and (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
+        fail("--session, --vehicle, --from and --to choose the rows of a table; --format mcap takes --around only", 2)
     with working("exporting", json, 1) as update:
-        exported = export(
-            logs, form, out, session=session, vehicle=vehicle, since_s=since_s, until_s=until_s, around=around,
-            force=force, progress=update,
-        )  # fmt: skip
+        if form == "mcap":
+            from aeroloop.service.logs.copies import copy
+
+            exported = copy(logs, out, around=around, force=force, progress=update)
+        else:
+            from aeroloop.service.logs.export import export
+
+            exported = export(
+                logs, form, out, session=session, vehicle=vehicle, since_s=since_s, until_s=until_s, around=around,
+                force=force, progress=update,
+            )  # fmt: skip
     show(exported, json, export_sheets)

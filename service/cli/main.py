@@ -37,7 +37,7 @@ app = typer.Typer(
 app.add_typer(run.group)
 for _name, _group, _help in (
     ("lab", lab.group, "Experiments, sweeps, tuning and certificates, in lockstep."),
-    ("log", log.group, "Review, compare, replay, check, step through, fork, recover and export logs."),
+    ("log", log.group, "Review, compare, replay, check, step through, fork, copy and export logs."),
     ("op", op.group, "Operate running roles over the network."),
     ("host", host.group, "Check this machine, install its daemons, make its keys."),
     ("show", show.group, "Print the configuration, the wire, a layout, examples."),

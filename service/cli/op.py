@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, show
-from aeroloop.service.cli.processes import run_alone
+from aeroloop.service.cli.entry import run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

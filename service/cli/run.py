@@ -24,8 +24,7 @@ from aeroloop.service.cli.common import (
     show,
     working,
 )
-from aeroloop.service.cli.entry import INTERRUPTED
-from aeroloop.service.cli.processes import run_alone, run_role
+from aeroloop.service.cli.entry import INTERRUPTED, run_alone, run_role
 
 if TYPE_CHECKING:
     from threading import Event
@@ -48,8 +47,8 @@ def demo(
     """Run the paper's experiment in three processes over Zenoh. Then review its log."""
     settings = load_for_loop(config, overrides, *["loop.lockstep=true"] * lockstep, bits=bits)
     from aeroloop.service.lab.demo import run_demo
-    from aeroloop.service.terminal.display import demo_progress
     from aeroloop.service.terminal.log_sheets import demo_sheets
+    from aeroloop.service.terminal.show import demo_progress
 
     hidden = json or not sys.stderr.isatty()
     if hidden:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.logs.frames import AXES
-from aeroloop.service.logs.session import Array, Integers, SessionKey, TrueStates
+from aeroloop.service.logs.session import Array, SessionKey, Truths
 from aeroloop.service.logs.ticks import Ticks, euler_deg
 
 EULER: Final = ("roll", "pitch", "yaw")
@@ -34,13 +34,8 @@ class Column(NamedTuple):
     boolean: bool = False  # 1.0 and 0.0
 
 
-def columns_of(
-    which: SessionKey, ticks: Ticks, truth: Array, settings: Settings, signals: Sequence[str] = ()
-) -> list[Column]:
-    """Every column of the table of some ticks of a session, with the latest true state at each; NaN before the first.
-
-    A row of `truth` is a tick, q, ω, the motors' voltages and the plant's `signals`: (n, 8 + actuators + signals).
-    """
+def columns_of(which: SessionKey, ticks: Ticks, truths: Truths, settings: Settings) -> list[Column]:
+    """Every column of the table of some ticks of a session, with the latest true state by then; NaN before any."""
     wire, period = settings.wire, settings.loop.period
     n = len(ticks.k)
     motors = list(map(str, wire.motors))
@@ -75,6 +70,9 @@ def columns_of(
         *_by("saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
              _reaches(ticks.voltages, outermost["voltage"]), motors, True),
     ]  # fmt: skip
+    parts = (truths.k, truths.attitude, truths.rate, truths.voltages, *truths.signals.values())
+    states = np.insert(np.column_stack(parts).astype(np.float64), 0, np.nan, axis=0)
+    truth = states[np.searchsorted(truths.k, ticks.k, side="right")]  # 0: before the first
     law, since = law_of(settings.law, period, wire.actuators), 0
     for name, initial in initial_state(law).items():
         until, unit = since + len(initial), law.units.get(name, "1")
@@ -90,18 +88,9 @@ def columns_of(
         *_attitude("truth_", "as the emulator had it", truth[:, 1:5]),
         *_by("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", truth[:, 5:8], AXES),
         *_by("truth_voltage_{}_V", "V", "at the emulator's motor {}", truth[:, 8 : 8 + len(motors)], motors),
-        *_by("plant_{}", "", "{}, the plant's own signal", truth[:, 8 + len(motors) :], signals),
+        *_by("plant_{}", "", "{}, the plant's own signal", truth[:, 8 + len(motors) :], list(truths.signals)),
         Column("truth_age_s", "s", "from the tick of the truth to this one", (ticks.k - truth[:, 0]) * period),
     ]
-
-
-def latest_truth(states: TrueStates, session: str, names: Sequence[str], k: Integers) -> Array:
-    """Rows of `columns_of`: of each tick the latest true state, with the signals `names`; NaN before the first."""
-    truth, signals = states.rows(session), states.signals(session)
-    unknown = np.full(len(truth), np.nan)
-    truth = np.column_stack([truth, *(signals.get(name, unknown) for name in names)])
-    at = np.searchsorted(truth[:, 0], k, side="right")  # 0: before the first
-    return np.asarray(np.insert(truth, 0, np.nan, axis=0)[at])
 
 
 def _by(name: str, unit: str, what: str, values: Array, axes: Sequence[str], boolean: bool = False) -> Iterator[Column]:

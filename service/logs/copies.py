@@ -1,4 +1,4 @@
-"""Copies of a log: what can be read of a broken one, and a run with every message decoded.
+"""A copy of a log: all that can be read of a run, or what is around an event, as one file with an index.
 
 A copy has its own ids; messages keep their topic, schema, times and sequence. Schemas, channels and attachments that
 several files repeat are written once.
@@ -7,92 +7,109 @@ several files repeat are written once.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
+from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Final
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, NotMcapError, records
+from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.trace import RECORD_S
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, records
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
+from aeroloop.service.logs.session import SessionKey, Unknown
 
-if TYPE_CHECKING:  # recovery needs no decoder
-    from aeroloop.service.viewers.channels import Decoder
-
-
-class RecoverError(AeroloopError):
-    """Nothing can be recovered; one line with the reason."""
+BEFORE_NS: Final = round(1.2e9 * RECORD_S)  # a cut begins so much earlier, to have a record of what was in force
 
 
-class Recovery(BaseModel, frozen=True):
-    """What was recovered."""
+class ExportError(AeroloopError):
+    """A log cannot be exported; one line with the reason."""
+
+
+class Exported(BaseModel, frozen=True):
+    """What was exported."""
 
     out: str
-    messages: int
-    channels: int
-    lost: list[str] = Field(description="what could not be read, a line each; empty if the file was whole")
+    format: str
+    sessions: list[str] | None = Field(default=None, description="`vehicle/session` of the rows; null of a log")
+    rows: int = Field(description="rows of a table, messages of a log")
+    columns: list[str] = Field(description="names of a table's columns, topics of a log's channels")
+    bytes: int
+    damages: list[str] = Field(description="what of the log could not be read")
+    unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
+    left_out: list[str] = Field(default=[], description="other sessions of the log that the table does not have")
+    around: list[str] = Field(default=[], description="events that `around` names; the export is around the first")
 
 
-def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
-    """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
-
-    Raises OutputError if the new file must not be written, or cannot; RecoverError if there is nothing to recover.
-    """
-    try:
-        broken.stat()
-        with writing(out, [broken], force=force) as part:
-            messages, names, lost = _copy([broken], part, "aeroloop log recover", progress)
-            if not messages:
-                raise RecoverError(f"{broken} holds no whole message")
-    except NotMcapError as error:
-        raise RecoverError(f"{error}, so there is nothing to recover") from None
-    except OSError as error:
-        raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
-    return Recovery(out=str(out), messages=messages, channels=len(names), lost=lost)
-
-
-def write_decoded(
-    recording: Recording, out: Path, progress: Progress | None = None, span_ns: Sequence[int] | None = None
-) -> tuple[int, list[str], list[str]]:
-    """Write a run as one log with every message decoded, which the recorder does at a bounded rate only.
-
-    With a span only messages recorded from its first to its last time [ns since 1970].
-
-    Returns how many messages were written, their topics, and what could not be read. Raises OSError.
-    """
-    from aeroloop.service.viewers.channels import Decoder
-
-    decoder = Decoder(rate_hz=None)
-    for description in recording.descriptions.values():
-        decoder.configure(description)
-    messages, names, _ = _copy(recording.paths, out, "aeroloop log export", progress, decoder, span_ns)
-    malformed = [f"malformed: {decoder.malformed} of what is decoded"] if decoder.malformed else []
-    return messages, names, [*recording.damaged, *malformed]
-
-
-def _copy(
+def copy(
     paths: Sequence[Path],
-    out: Path,
-    program: str,
-    progress: Progress | None,
-    decoder: Decoder | None = None,
-    span_ns: Sequence[int] | None = None,
-) -> tuple[int, list[str], list[str]]:
-    """Copy what can be read of some files into one; with a decoder, what it decodes replaces what was decoded before.
+    out: Path | None = None,
+    *,
+    around: tuple[str, float] | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Exported:
+    """Write all that can be read of a run into one log, or so many seconds before and after an event.
 
-    Returns how many messages were written, their topics, and what could not be read, a line each. Raises NotMcapError,
-    and OSError if a file cannot be read or the new one cannot be written.
+    The new file has the first log's name with another ending if `out` is None; events are as of `events_named`.
+
+    Raises:
+        ExportError: There is nothing to copy, or no such event.
+        OutputError: The file must not be written, or cannot.
+        ReviewError: The log cannot be read.
     """
-    messages, done, size = 0, 0, max(1, sum(path.stat().st_size for path in paths))
-    names, attached, damages = set[str](), set[str](), list[str]()
+    out, events, span_ns = out or beside(paths, "-copy.mcap"), [], (-inf, inf)
+    with writing(out, paths, force=force) as part:
+        recording = Recording(paths, progress)
+        if around is not None:
+            events = events_named(recording, around[0])
+            at_ns, half_ns = events[0][2], round(around[1] * 1e9)
+            span_ns = at_ns - half_ns - BEFORE_NS, at_ns + half_ns
+        messages, topics = _copy(recording.paths, part, span_ns)
+        if not messages:
+            raise ExportError(f"{recording.name} holds no whole message")
+        size = part.stat().st_size
+    return Exported(
+        out=str(out), format="mcap", rows=messages, columns=topics, bytes=size, damages=recording.unread,
+        around=[one.text for one, *_ in events],
+    )  # fmt: skip
+
+
+def beside(paths: Sequence[Path], ending: str) -> Path:
+    """The path beside the first log that has its name, with another ending."""
+    log = paths[0].resolve() if paths[0].is_dir() else paths[0]  # "." has no name
+    return log.with_name((log.name if log.is_dir() else log.stem) + ending)
+
+
+def events_named(recording: Recording, what: str, vehicle: str | None = None) -> list[tuple[Event, SessionKey, int]]:
+    """Events by `trip`, `fault`, `mark` or words of a mark, each with its session and when it was recorded [ns].
+
+    Raises ExportError if there is none.
+    """
+    found, kind = list[tuple[Event, SessionKey, int]](), {"trip": "tripped", "mark": "marked"}.get(what, what)
+    for address, message in recording.messages:
+        if address.topic.name == "event" and vehicle in (None, address.vehicle):
+            with suppress(ValueError):  # malformed, which a review counts
+                event = Event.model_validate_json(message.data)
+                if event.kind == kind or (event.kind == "marked" and what in event.text):
+                    found.append((event, (address.vehicle, event.session or ""), message.log_time))
+    if not found:
+        raise ExportError(f"{recording.name} has no event {what!r}: name trip, fault, mark, or words of a mark")
+    return found
+
+
+def _copy(paths: Sequence[Path], out: Path, span_ns: tuple[float, float]) -> tuple[int, list[str]]:
+    """Copy messages recorded within a span and all else into one file; returns how many, and their topics."""
+    messages, names, attached = 0, set[str](), set[str]()
     with out.open("wb") as file:
         writer = Writer(file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
-        writer.start(profile="aeroloop", library=program)
+        writer.start(profile="aeroloop", library="aeroloop log export")
         schema_id = cache(writer.register_schema)
 
         @cache
@@ -101,29 +118,17 @@ def _copy(
             return writer.register_channel(topic, encoding, schema)
 
         for path in paths:
-            schemas, channels = {0: 0}, dict[int, tuple[int, str]]()  # by the ids of this file
-
-            def report(read: int, before: int = done) -> None:
-                if progress is not None:
-                    progress((before + read) / size)
-
-            for record in records(path, damages, report):
+            schemas, channels = {0: 0}, dict[int, int]()  # by the ids of this file
+            for record in records(path):
                 match record:
-                    case Message(log_time=at) if span_ns and not span_ns[0] <= at <= span_ns[1]:
-                        pass
-                    case Message() if record.channel_id in channels:
-                        channel, topic = channels[record.channel_id]
+                    case Message() if record.channel_id in channels and span_ns[0] <= record.log_time <= span_ns[1]:
+                        channel = channels[record.channel_id]
                         writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
-                        address = topics.read_key(topic) if decoder else None
-                        decoded = decoder.take(address, record.data, record.publish_time) if decoder and address else []
-                        for topic, shape, data, at_ns in decoded:  # log time is that of publication, as recorded
-                            schema = schema_id(shape.name, shape.encoding, shape.schema)
-                            writer.add_message(channel_id(topic, shape.message_encoding, schema), at_ns, data, at_ns)
-                        messages += 1 + len(decoded)
+                        messages += 1
                     case Schema():
                         schemas[record.id] = schema_id(record.name, record.encoding, record.data)
-                    case Channel(id_, topic, encoding, _, schema) if not (decoder and topic.startswith("/")):
-                        channels[id_] = channel_id(topic, encoding, schemas.get(schema, 0)), topic
+                    case Channel(id_, topic, encoding, _, schema):
+                        channels[id_] = channel_id(topic, encoding, schemas.get(schema, 0))
                     case Metadata():
                         writer.add_metadata(record.name, record.metadata)
                     case Attachment() if record.name not in attached:
@@ -131,6 +136,5 @@ def _copy(
                         writer.add_attachment(
                             record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
-            done += path.stat().st_size
         writer.finish()
-    return messages, sorted(names), damages
+    return messages, sorted(names)

@@ -22,7 +22,17 @@ from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, read_batch
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
-from aeroloop.service.logs.session import Entry, Session, SessionKey, Source, TraceIndex, join, table_of
+from aeroloop.service.logs.session import (
+    Entry,
+    Session,
+    SessionKey,
+    Source,
+    TraceIndex,
+    Truths,
+    join,
+    table_of,
+    true_states,
+)
 
 Progress = Callable[[float], None]  # called repeatedly with the share done, 0…1
 
@@ -155,6 +165,13 @@ class Recording:
             unknown,
             *join(controller, plant, first, last),
         )
+
+    def true_states(self, which: SessionKey, actuators: int) -> Truths:
+        """True states of a session of a plant with so many motors; malformed ones are counted."""
+        named = ("truth", which[0])
+        payloads = (found.data for address, found in self.messages if (address.topic.name, address.vehicle) == named)
+        truths, self.malformed["truth"] = true_states(payloads, which[1], actuators)
+        return truths
 
     def plants(self) -> Iterator[tuple[Source, Description | None, list[Batch]]]:
         """Processes of plants, each with its description as it began, and all its batches in the order of its rows."""
@@ -311,12 +328,10 @@ def _read_description(text: str | bytes, address: Address | None) -> Description
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
-    """Files, and those in folders without what `log export --format mcap` wrote there."""
+    """Files, and those in folders."""
     files: list[Path] = []
     for path in paths:
-        found = [path]
-        if path.is_dir():
-            found = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
+        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         if not found:
             raise ReviewError(f"there is no .mcap file in {path}")
         files += found

@@ -389,39 +389,37 @@ def _places(ticks: Integers, places: npt.NDArray[np.intp], k: Integers) -> Place
     return np.where(ticks[at] == k, places[first][at], -1).astype(np.int32)
 
 
-class TrueStates:
-    """Collects the true states of some sessions of a vehicle, by name with the number of motors."""
+class Truths(NamedTuple):
+    """True states by tick, ascending, none twice, with the plant's further signals; a signal is NaN if not known."""
 
-    def __init__(self, actuators: Mapping[str, int]) -> None:
-        self._actuators = actuators
-        self._states: dict[str, dict[int, tuple[tuple[float, ...], dict[str, float | None]]]]
-        self._states = {session: {} for session in actuators}
-        self._names: dict[str, set[str]] = {session: set() for session in actuators}
+    k: Integers  # Shape (n,)
+    attitude: Array  # q. Shape (n, 4)
+    rate: Array  # ω, body frame [rad/s]. Shape (n, 3)
+    voltages: Array  # at the motors [V]. Shape (n, actuators)
+    signals: Mapping[str, Array] = {}  # by name. Shapes (n,)
 
-    def add(self, data: bytes) -> None:
-        """Add a message, unless it is of another session; of a tick, the first counts.
 
-        Raises:
-            ValueError: It is malformed: anyone on the network may publish one, of any tick and any plant's motors.
-        """
-        truth = Truth.model_validate_json(data)
-        if (session := truth.session) is None or session not in self._actuators or (k := truth.session_tick) is None:
-            return
-        if not 0 <= k < NEVER or len(truth.voltages) != self._actuators[session]:
-            raise ValueError("a true state of no tick of its session")
-        if len(self._names[session] | truth.signals.keys()) > MAX_SIGNALS:
-            raise ValueError("more signals than a plant has")
-        if k not in self._states[session]:
-            self._states[session][k] = (k, *truth.attitude, *truth.rate, *truth.voltages), truth.signals
-            self._names[session].update(truth.signals)
+def true_states(messages: Iterable[bytes], session: str, actuators: int) -> tuple[Truths, int]:
+    """True states of a session, of a tick the first, and how many of the messages are malformed.
 
-    def rows(self, session: str) -> Array:
-        """Tick, q, ω and the motors' voltages, ascending. Shape (n, 8 + actuators)."""
-        rows = [row for _, (row, _) in sorted(self._states[session].items())]
-        return np.array(rows, np.float64).reshape(-1, 8 + self._actuators[session])
-
-    def signals(self, session: str) -> dict[str, Array]:
-        """The plant's further signals by name, a value for each of `rows`; NaN where it is not known. Shapes (n,)."""
-        found = [signals for _, (_, signals) in sorted(self._states[session].items())]
-        names = sorted(self._names[session])
-        return {name: np.array([signals.get(name) for signals in found], np.float64) for name in names}
+    Anyone on the network may publish one, of any tick, of any plant's motors and with any signals.
+    """
+    found, names, malformed = dict[int, tuple[tuple[float, ...], dict[str, float | None]]](), set[str](), 0
+    for data in messages:
+        try:
+            truth = Truth.model_validate_json(data)
+        except ValueError:
+            malformed += 1
+            continue
+        if truth.session != session or (k := truth.session_tick) is None:
+            continue
+        possible = 0 <= k < NEVER and len(truth.voltages) == actuators
+        if not possible or len(names | truth.signals.keys()) > MAX_SIGNALS:
+            malformed += 1
+        elif k not in found:
+            found[k] = (k, *truth.attitude, *truth.rate, *truth.voltages), truth.signals
+            names |= truth.signals.keys()
+    ordered = [found[k] for k in sorted(found)]
+    rows = np.array([row for row, _ in ordered], np.float64).reshape(-1, 8 + actuators)
+    signals = {name: np.array([its.get(name) for _, its in ordered], np.float64) for name in sorted(names)}
+    return Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8], rows[:, 8:], signals), malformed

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 WORK_EVERY_S: Final = 0.5  # messages can wait: a chunk is closed only once a second
 STATUS_EVERY_S: Final = 1.0
-DECODED_HZ: Final = 10.0  # of each decoded channel beside the raw messages; `log export --format mcap` has all
+DECODED_HZ: Final = 10.0  # of each decoded channel beside the raw messages
 END_S: Final = 8.0  # longest time for what caches hold when recording ends; a service manager kills after 10
 
 

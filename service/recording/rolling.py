@@ -242,7 +242,7 @@ class RollingLog:
             what = f"{lost} messages and the index" if lost else "the index"
             raise RecorderError(
                 f"{what} of {self.path} could not be written: {error.strerror}; "
-                "what came before is whole, and `aeroloop log recover` gives it an index"
+                "what came before is whole, and `aeroloop log export --format mcap` gives it an index"
             ) from None
         if waiting:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
@@ -292,7 +292,7 @@ class RollingLog:
         except OSError as error:
             last.close()
             what = f"the index of {last.path} could not be written: {error.strerror}"
-            self._report(f"{what}; `aeroloop log recover` gives it one", True)
+            self._report(f"{what}; `aeroloop log export --format mcap` gives it one", True)
         self._remove_oldest()
 
     def _end(self, file: LogFile) -> None:

@@ -7,7 +7,7 @@ from json import dumps
 from typing import Any, Final, NamedTuple
 
 from aeroloop.service.figures import Figures
-from aeroloop.service.review.report import Findings, Mark, Spread
+from aeroloop.service.review.report import Findings, Mark
 from aeroloop.service.review.requirements import FIGURES, Figure, percent, value_of
 
 
@@ -28,12 +28,12 @@ class Row(NamedTuple):
 
 
 class Duration(NamedTuple):
-    """A duration of a run: PERCENTILES as texts, and the distribution if there is one."""
+    """A duration of a run: PERCENTILES as texts, and of how many ticks."""
 
     run: int
     label: str
     percentiles: list[str]
-    spread: Spread | None = None
+    ticks: int
 
 
 DURATIONS: Final = {
@@ -41,13 +41,6 @@ DURATIONS: Final = {
     "period": "period",
 }  # fmt: skip
 PERCENTILES: Final = {"p50": "p50", "p90": "p90", "p99": "p99", "p999": "p99.9", "max": "longest"}
-
-UNMET: Final = {
-    "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
-    "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
-    "C.30": "the command is saturated or missing, against (C.30)",
-    "Assumption 3": "the attitude error is larger than the certificate assumes",
-}  # premises of Lemma 1 that a true state may not satisfy, and what that means
 
 
 def figure_rows(runs: Sequence[Figures]) -> list[Row]:
@@ -75,16 +68,13 @@ def _delta(figure: Figure, first: float | None, value: float | None) -> str:
 
 
 def durations(runs: Sequence[Findings]) -> list[Duration]:
-    """Every duration that a run has, those of one kind together, the age of measurements last."""
-    found = [
-        Duration(i, label, [micros(getattr(run.timing[name], each)) for each in PERCENTILES], run.timing[name])
+    """Every duration that a run has, those of one kind together."""
+    return [
+        Duration(i, label, [micros(getattr(run.timing[name], each)) for each in PERCENTILES], run.timing[name].count)
         for name, label in DURATIONS.items()
         for i, run in enumerate(runs)
         if name in run.timing
     ]
-    ages = [(i, run.age_us) for i, run in enumerate(runs) if run.age_us]
-    texts = [(i, [micros(age[each]) if each in age else "–" for each in PERCENTILES]) for i, age in ages]
-    return found + [Duration(i, "age when used", percentiles) for i, percentiles in texts]
 
 
 def missing(run: Findings) -> list[str]:
@@ -99,27 +89,19 @@ def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:
     if (found := run.theorem) is None:
         return []
     sentences: list[tuple[bool | None, str]] = [(found.holds, found.verdict)]  # None: no theorem
-    judged = [("Lemma 1", found.broken, 0), ("the bound at every instant", found.pointwise_share, 1)]
-    kept = " and ".join(what for what, worst, _ in judged if worst is not None)
-    broke = " and ".join(what for what, worst, most in judged if worst is not None and worst > most)
-    if found.held is not None:
-        sentences.append((found.held, f"The run kept to {kept}." if found.held else f"The run broke {broke}."))
-    elif found.holds is not None:
-        sentences.append((None, f"Nothing of it could be judged: {run.reasons.get('theorem.held', 'no true states')}."))
-    if found.held is None:
+    if found.holds and found.held is None:
+        sentences.append((None, f"Whether it held could not be judged: {run.reasons['theorem.held']}."))
+    if found.held is None or found.pointwise_share is None:
         return sentences
     span = f"from {found.since_s:g} s" if found.since_s else "from the beginning"
     until = "" if found.until_s is None else f" until {found.until_s:g} s, where gains or reference changed"
-    unmet = [f"at {n:,} {UNMET.get(name, name)}" for name, n in found.outside.items() if n]
-    details = [f"Judged {span}{until}, by {found.samples:,} true states", *unmet]
-    if found.lemma:
-        closest = max(found.lemma, key=lambda check: check.closest)
-        nearest = f"of Lemma 1 ({closest.equation}) is nearest to its bound, {percent(closest.closest)} % of it"
-        details.append(f"{nearest}, by the {found.judged:,} states that satisfy its premises")
-    if found.pointwise_share is not None:
-        share = f"‖z‖ is at most {percent(found.pointwise_share)} % of its bound, at {found.pointwise_at_s:g} s"
-        details.append(f"{share}, where the bound falls to {found.pointwise_bound:.4g}")
-    return [*sentences, (None, "; ".join(details) + ".")]
+    share = f"‖z‖ is at most {percent(found.pointwise_share)} % of its bound, at {found.pointwise_at_s:g} s"
+    return [
+        *sentences,
+        (found.held, f"The run {'kept to' if found.held else 'broke'} the bound."),
+        (None, f"Judged {span}{until}, by {found.pointwise_judged:,} of {found.samples:,} true states; {share}, where "
+               f"the bound falls to {found.pointwise_bound:.4g}."),
+    ]  # fmt: skip
 
 
 def grave(mark: Mark) -> bool:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
-from math import inf, isfinite
+from collections.abc import Callable
+from math import inf
 from operator import itemgetter
 from typing import Final, NamedTuple
 
@@ -21,36 +21,24 @@ from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.recording import Recording
-from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, TrueStates
+from aeroloop.service.logs.session import Array, Integers, Session, SessionKey, Truths
 from aeroloop.service.logs.ticks import Codes, Flags, Ticks
 from aeroloop.service.review.report import FaultInterval, Gap, Mark, Spread
 
 LONGEST_GAPS: Final = 100
-_BIN_EDGES_US: Final = 2 ** (np.arange(32 * 16 + 1) / 16)
-"""16 bins an octave, from 1 µs to 2³² µs, as of protocol/runtime/timing.py."""
 MAX_MARKS: Final = 300  # marks of a kind and role; one more stands for the rest
 
 _MODELS: Final[dict[str, type[Event | Loss | Status]]] = {"event": Event, "loss": Loss, "status": Status}
 
 
-class Truths(NamedTuple):
-    """True states by tick, ascending, none twice, with the plant's further signals. Shapes (n,), (n, 4), (n, 3)."""
-
-    k: Integers
-    attitude: Array
-    rate: Array
-    signals: Mapping[str, Array] = {}
-
-
 class Messages(NamedTuple):
-    """Messages beside the traces, one session's true states, and how many are malformed by topic, of any vehicle.
+    """Messages beside the traces, and one session's true states.
 
     Each message of the vehicle has its time on the wall clock of the role that published it [ns]; in order of time.
     """
 
     published: list[tuple[int, str, Event | Loss | Status]]
     truths: Truths
-    malformed: Counter[str]
 
     def statuses(self, role: str) -> list[Status]:
         """Statuses of a role, in order of time."""
@@ -58,31 +46,23 @@ class Messages(NamedTuple):
 
 
 def read_messages(recording: Recording, which: SessionKey, actuators: int) -> Messages:
-    """Read the messages of a session and its vehicle; one that a restarted recorder recorded again counts once."""
-    malformed, known = Counter[str](), set[int]()
-    published = list[tuple[int, str, Event | Loss | Status]]()
-    states = TrueStates({which[1]: actuators})
+    """Read the messages of a session and its vehicle; one that a restarted recorder recorded again counts once.
 
+    Malformed ones are counted by the recording, of whatever vehicle they are.
+    """
+    published, known = list[tuple[int, str, Event | Loss | Status]](), set[int]()
     for address, found in recording.messages:
-        at_ns = found.publish_time
-        name = address.topic.name
+        at_ns, name = found.publish_time, address.topic.name
+        if name == "truth" or (identity := hash((address.vehicle, found.data, at_ns))) in known:
+            continue
+        known.add(identity)
         try:
-            if name == "truth":
-                if address.vehicle == which[0]:
-                    states.add(found.data)
-            elif (identity := hash((address.vehicle, found.data, at_ns))) not in known:
-                known.add(identity)
-                message = _MODELS[name].model_validate_json(found.data)
-                age = message.age_us if isinstance(message, Status) else None
-                if age is not None and not isfinite(age.p50 + age.p99 + age.max):
-                    raise ValueError
-                if address.vehicle == which[0]:
-                    published.append((at_ns, address.role or "recorder", message))
+            message = _MODELS[name].model_validate_json(found.data)
+            if address.vehicle == which[0]:
+                published.append((at_ns, address.role or "recorder", message))
         except ValueError:  # untrusted publishers may send anything, such as 1e999
-            malformed[name] += 1
-    rows = states.rows(which[1])
-    truths = Truths(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5:8], states.signals(which[1]))
-    return Messages(sorted(published, key=itemgetter(0)), truths, malformed)
+            recording.malformed[name] += 1
+    return Messages(sorted(published, key=itemgetter(0)), recording.true_states(which, actuators))
 
 
 def happened(
@@ -130,15 +110,6 @@ def happened(
             time_s = None if outside else round(shown * period, 9)
             marks.append(((outside, tick), Mark(time_s=time_s, kind=kind, role=role, text=text)))
     return [mark for _, mark in sorted(marks, key=itemgetter(0))], trips, dict(losses)
-
-
-def age_us(messages: Messages, which: SessionKey) -> dict[str, float] | None:
-    """Age of measurements when used: median of all medians, largest p99 and maximum [µs]; None without."""
-    ages = [one.age_us for one in messages.statuses("controller") if one.session == which[1] and one.age_us]
-    if not ages:
-        return None
-    median = round(float(np.median([age.p50 for age in ages])), 1)
-    return {"p50": median, "p99": max(age.p99 for age in ages), "max": max(age.max for age in ages)}
 
 
 def fault_intervals(messages: Messages, session: Session) -> list[FaultInterval]:
@@ -220,11 +191,9 @@ def timing(ticks: Ticks) -> dict[str, Spread]:
 
 def spread(nanoseconds: Array) -> Spread:
     """Distribution of at least one duration [ns]; under 1 µs counts as 1 µs. Shape (n,)."""
-    us = np.clip(nanoseconds * 1e-3, *_BIN_EDGES_US[[0, -1]])
-    counts, _ = np.histogram(us, _BIN_EDGES_US)
+    us = np.maximum(nanoseconds * 1e-3, 1.0)
     p50, p90, p99, p999, most = np.percentile(us, [50, 90, 99, 99.9, 100]).round(1).tolist()
-    bins = [(round(float(_BIN_EDGES_US[i]), 3), int(counts[i])) for i in np.flatnonzero(counts)]
-    return Spread(count=len(us), p50=p50, p90=p90, p99=p99, p999=p999, max=most, bins=bins)
+    return Spread(count=len(us), p50=p50, p90=p90, p99=p99, p999=p999, max=most)
 
 
 def periods_ns(ticks: Ticks) -> Array:

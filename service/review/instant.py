@@ -9,7 +9,6 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from math import isnan
@@ -23,10 +22,9 @@ from aeroloop.protocol.messages.models import EventKind
 from aeroloop.protocol.messages.trace import Outcome, Received, Sent
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import configured_gains, initial_state, law_of
-from aeroloop.service.logs.columns import Column, columns_of, latest_truth
+from aeroloop.service.logs.columns import Column, columns_of
 from aeroloop.service.logs.frames import Direction, FrameSignal, read_frame
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import TrueStates
 from aeroloop.service.logs.ticks import recompute
 from aeroloop.service.review.events import happened, read_messages
 from aeroloop.service.review.report import Mark
@@ -89,12 +87,7 @@ class Instants:
         span = int(its.k[0]), int(its.k[-1])
         messages = read_messages(recording, self.which, its.settings.wire.actuators)
         self.marks = [mark for mark in happened(messages, its, span, alone=False)[0] if mark.time_s is not None]
-        self._states = TrueStates({self.which[1]: its.settings.wire.actuators})
-        for address, message in recording.messages:
-            if (address.topic.name, address.vehicle) == ("truth", self.which[0]):
-                with suppress(ValueError):  # malformed, which a review counts
-                    self._states.add(message.data)
-        self._names = sorted(self._states.signals(self.which[1]))
+        self._truths = messages.truths
         self._ticks = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share))).ticks
         law = law_of(its.settings.law, self._period, its.settings.wire.actuators)
         self._gains, self._state = configured_gains(law), initial_state(law)
@@ -172,9 +165,7 @@ class Instants:
         )  # fmt: skip
 
     def _columns(self, which: slice) -> list[Column]:
-        ticks = self._ticks.where(which)
-        truth = latest_truth(self._states, self.which[1], self._names, ticks.k)
-        return columns_of(self.which, ticks, truth, self.settings, self._names)
+        return columns_of(self.which, self._ticks.where(which), self._truths, self.settings)
 
     def _frame(self, direction: Direction, sender: Any, receiver: Any, tick: int) -> Frame:
         """A frame of a tick from both ends' rows; of a silent one what it repeats."""

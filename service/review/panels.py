@@ -13,9 +13,9 @@ import numpy as np
 
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.registry import initial_state, law_of
-from aeroloop.service.logs.session import Array, Integers
+from aeroloop.service.logs.session import Array, Integers, Truths
 from aeroloop.service.logs.ticks import Ticks, euler_deg
-from aeroloop.service.review.events import Truths, error_deg, of_nearer_sign, periods_ns
+from aeroloop.service.review.events import error_deg, of_nearer_sign, periods_ns
 from aeroloop.service.review.report import Line, Panel
 from aeroloop.service.review.theorem import TheoremCheck
 
@@ -31,7 +31,8 @@ NUMBERS: Final[dict[str, dict[str, str]]] = {
     "wind": {"error": "C.12", "rate_error": "C.13", "input": "C.14"},
 }  # number of the paper's figure of a quantity, by case
 
-NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)))  # of a log without true states
+NO_TRUTHS: Final = Truths(np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 3)), np.empty((0, 2)))
+"""Of a log without true states."""
 
 _Quantity = tuple[str, str, Sequence[str], str, dict[str, Array]]  # group, title, label of each column, unit, lines
 

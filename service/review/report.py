@@ -16,7 +16,7 @@ from aeroloop.service.logs.session import Array, Missing, Unknown
 
 
 class Spread(BaseModel, frozen=True):
-    """Distribution of a duration: percentiles [µs], and a histogram of bins 4.4 % wide."""
+    """Distribution of a duration: percentiles [µs]."""
 
     count: int
     p50: float
@@ -24,7 +24,6 @@ class Spread(BaseModel, frozen=True):
     p99: float
     p999: float
     max: float
-    bins: list[tuple[float, int]] = Field(description="lower edge [µs] and count of every bin that is not empty")
 
 
 class Gap(BaseModel, frozen=True):
@@ -79,24 +78,12 @@ class Check(BaseModel, frozen=True):
     found: str
 
 
-class LemmaCheck(BaseModel, frozen=True):
-    """An inequality of Lemma 1, or of those that it builds on, checked at true states."""
-
-    equation: str = Field(description="number in the paper")
-    what: str = Field(description="its left-hand side, in the paper's letters")
-    samples: int
-    broken: int = Field(description="samples at which it does not hold")
-    closest: float = Field(description="largest left-hand side as a share of the bound")
-    closest_s: float = Field(description="when that was, on the law's clock [s]")
-    broken_s: float | None = Field(default=None, description="when it was first broken [s]; null where never")
-
-
 class TheoremFindings(BaseModel, frozen=True):
     """What is proven of a session, and whether the session kept to it. Times are on the law's clock [s]."""
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
     holds: bool | None = Field(default=None, description="null where nothing can be promised")
-    held: bool | None = Field(description="whether the run kept to all of it that could be judged")
+    held: bool | None = Field(description="whether the run kept to it, as far as that could be judged")
     pointwise_radius: float | None = Field(default=None, description="bound of ‖z‖ in the end [1, rad/s], if certified")
     pointwise_deg: float | None = Field(default=None, description="the attitude error within that bound [deg]")
     pointwise_share: float | None = Field(
@@ -109,14 +96,6 @@ class TheoremFindings(BaseModel, frozen=True):
     since_s: float = Field(description="judged from when the reference was reached")
     until_s: float | None = Field(description="judged until gains or reference changed; null: to the end")
     samples: int = Field(description="true states that belong to a tick that is judged")
-    outside: dict[str, int] = Field(
-        default={},
-        description="how many of them do not satisfy a premise: (C.28), (C.29): sensors err by no more than the "
-        "quantizers; (C.30): the command is not saturated; Assumption 3: the assumed attitude error",
-    )
-    judged: int = Field(default=0, description="how many satisfy all of them, and so judge the inequalities")
-    lemma: list[LemmaCheck] = []
-    broken: int | None = Field(default=None, description="inequalities broken, over all of them and all samples")
 
 
 class Findings(Figures):
@@ -135,7 +114,6 @@ class Findings(Figures):
     clock_offset_us: list[float] | None = Field(
         default=None, description="the controller's monotonic clock less the plant's, at the first and the last tick"
     )
-    age_us: dict[str, float] | None = Field(description="age of measurements when used: p50, p99, max")
     gaps: list[Gap] = Field(description="the longest hundred, in order of time")
     gap_count: int
     saturated: dict[str, float] = Field(description="share of values at the outermost level, 0…1, by signal")

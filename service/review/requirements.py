@@ -70,13 +70,11 @@ FIGURES: Final = (
     Figure("losses", "messages the recorder lost", ""),
     Figure("trips", "trips", ""),
     Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
-    Figure("theorem.broken", "inequalities of Lemma 1 broken", ""),
     Figure("duration_s", "duration", "s", seconds),
 )  # fmt: skip
 
 _DURATIONS: Final = [
     *(f"latency_us.{percentile}" for percentile in ("p50", "p99", "p999", "max")),
-    *(f"age_us.{percentile}" for percentile in ("p50", "p99", "max")),
     *(f"timing.{name}.{percentile}"
       for name in ("latency", "period", "measurement_delay", "command_delay")
       for percentile in ("p50", "p90", "p99", "p999", "max")),

@@ -12,27 +12,14 @@ from math import inf, isnan
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import BaseModel, Field
-
 from aeroloop.protocol.messages.models import Description, Percentiles, Status
 from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.figures import Figures, figures
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import Missing, Session, Unknown
+from aeroloop.service.logs.session import Missing, Session, Truths, Unknown
 from aeroloop.service.logs.ticks import Ticks, recompute
-from aeroloop.service.review.events import (
-    Messages,
-    Truths,
-    age_us,
-    fault_intervals,
-    gaps,
-    happened,
-    lapses,
-    read_messages,
-    saturation,
-    timing,
-)
+from aeroloop.service.review import events
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
 from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, differences, flat
 from aeroloop.service.review.requirements import Limit
@@ -107,19 +94,18 @@ def read(
         span = int(its.k[0]), int(its.k[-1])
         since, until = since_s / loop.period, until_s / loop.period
         unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
-    messages = read_messages(recording, which, settings.wire.actuators)
+    messages = events.read_messages(recording, which, settings.wire.actuators)
     recording.release()
-    marks, trips, losses = happened(messages, its, span, session is not None)
-    faults = fault_intervals(messages, its)
+    marks, trips, losses = events.happened(messages, its, span, session is not None)
+    faults = events.fault_intervals(messages, its)
     judged = recompute(its, progress and (lambda share: progress(INDEXING + (1 - INDEXING) * share)))
-    ticks, went = judged.ticks, lapses(its, judged.missed)
+    ticks, went = judged.ticks, events.lapses(its, judged.missed)
     its = replace(its, controller=its.controller[:0].copy(), plant=its.plant[:0].copy())  # 200 MB of an hour
 
-    spreads, age = ({}, None) if loop.lockstep else (timing(ticks), age_us(messages, which))
+    spreads = {} if loop.lockstep else events.timing(ticks)
     latency, offset = spreads.get("latency"), None if isnan(judged.offset_ns[0]) else judged.offset_ns
     unavailable = {
         "latency_us": None if latency else "no measurement was answered",
-        "age_us": None if age else "the log has no status of the controller with an age",
         "timing.period": None if "period" in spreads else "fewer than two measurements",
         "timing.latency": None if latency else "no measurement was answered",
         "clock_offset_us": None if offset else "too few ticks have all four times of sending and receiving",
@@ -132,13 +118,13 @@ def read(
         watchdog_s=settings.plant.watchdog_s, unsent=judged.unsent, log=recording.name, trips=trips,
         latency=Percentiles(**latency.model_dump(include=set(Percentiles.model_fields))) if latency else None,
         reasons={key: why for key, why in reasons.items() if key in Figures.model_fields},
-        damages=[*recording.unread, *(f"malformed: {n} of {topic}" for topic, n in sorted(messages.malformed.items()))],
+        damages=recording.unread,
     )  # fmt: skip
     controller = its.descriptions.get("controller")
     certificate = controller.certificate if controller else None
     theorem = check_theorem(settings, ticks, messages.truths, its.changes, certificate, faults=bool(faults))
-    gap_count, longest = gaps(judged.answered, loop.period)
-    saturated, invalid = saturation(settings.wire, judged.measurements, judged.commands)
+    gap_count, longest = events.gaps(judged.answered, loop.period)
+    saturated, invalid = events.saturation(settings.wire, judged.measurements, judged.commands)
     missing = [gap for gap in recording.missing if gap.vehicle == which[0]]
     started_s = ticks.wall_ns[:1] * 1e-9
     recorded = [
@@ -151,7 +137,7 @@ def read(
         vehicle=which[0], session=which[1], sessions=len(recording.sessions_of(which[0])), recorded=recorded,
         started="".join(datetime.fromtimestamp(at_s, UTC).isoformat(timespec="milliseconds") for at_s in started_s),
         disagreements=disagreements(its.descriptions), theorem=theorem.findings, marks=marks, faults=faults,
-        timing=spreads, clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None, age_us=age,
+        timing=spreads, clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None,
         gaps=longest, gap_count=gap_count, saturated=saturated, invalid=invalid, losses=losses, lapses=went,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS}, missing=missing,
         unknown=its.unknown, unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
@@ -163,7 +149,7 @@ def read(
     return Review(merits, findings, settings, ticks, theorem, messages.truths, name, facts, part)
 
 
-def _facts(recording: Recording, session: Session, messages: Messages) -> dict[str, dict[str, Any]]:
+def _facts(recording: Recording, session: Session, messages: events.Messages) -> dict[str, dict[str, Any]]:
     """Facts about software and host by role."""
     described = session.descriptions.items()
     facts = {role: {"host": one.host, **one.facts, "versions": one.versions} for role, one in described}
@@ -196,25 +182,14 @@ def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
 # ── several runs side by side ──
 
 
-class SettingDifference(BaseModel, frozen=True):
-    """A dotted key of the configuration whose value is not the same in every run; null where a run has no such key."""
+def compared(reports: Sequence[Report]) -> dict[str, Any]:
+    """Findings of runs by their names, which differ, and what differs in their configurations, as `--json` prints it.
 
-    key: str
-    values: dict[str, Any] = Field(description="by run")
-
-
-class Comparison(BaseModel, frozen=True):
-    """Runs by their names, which differ, and what differs in their configurations (`log compare --json`)."""
-
-    runs: dict[str, Findings]
-    differences: list[SettingDifference]
-
-    @classmethod
-    def of(cls, reports: Sequence[Report]) -> Comparison:
-        """Comparison of runs whose names differ."""
-        runs = {run.name: run.findings for run in reports}
-        rows = [(key, dict(zip(runs, values, strict=True))) for key, values in differences(reports)]
-        return cls(runs=runs, differences=[SettingDifference(key=key, values=values) for key, values in rows])
+    A dotted key whose value is not the same in every run has a value by run, null where a run has no such key.
+    """
+    runs = {run.name: run.findings for run in reports}
+    rows = [{"key": key, "values": dict(zip(runs, values, strict=True))} for key, values in differences(reports)]
+    return {"runs": runs, "differences": rows}
 
 
 def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:

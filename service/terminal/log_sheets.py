@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from aeroloop.service.lab.check import LogCheck
     from aeroloop.service.lab.demo import DemoFigures
     from aeroloop.service.lab.fork import Fork
-    from aeroloop.service.logs.copies import Recovery
-    from aeroloop.service.logs.export import Exported
+    from aeroloop.service.logs.copies import Exported
     from aeroloop.service.logs.replay import EndReplay, Replay
     from aeroloop.service.review.instant import Instant
 
@@ -203,12 +202,6 @@ def _some(lines: Sequence[str]) -> list[str]:
     return [*lines[:SHOWN], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
-def recovery_sheets(recovery: Recovery) -> Sheets:
-    """What was recovered, and a line for each part that was not."""
-    found = f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels"
-    yield "\n".join([found, *(f"not recovered, {line}" for line in recovery.lost)]), []
-
-
 def export_sheets(exported: Exported) -> Sheets:
     """What was exported, and what of the log was not."""
     if exported.sessions is None:
@@ -220,7 +213,7 @@ def export_sheets(exported: Exported) -> Sheets:
         lines.append(f"around: {around[0]}" + (f" ({len(around) - 1} more such events)" if len(around) > 1 else ""))
     if others := exported.left_out:
         names = ", ".join(_some(others))
-        lines.append(f"not exported of this log: {names}; choose by --vehicle and --session, which may be all")
+        lines.append(f"not exported of this log: {names}; choose by --vehicle and --session")
     yield "\n".join([f"{exported.out}: {found}", *lines]), []
 
 

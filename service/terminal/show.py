@@ -1,19 +1,29 @@
-"""Printer of results: rows of text as a table for a terminal of any width, or as Markdown."""
+"""What is printed: rows of text as a table for a terminal of any width, or as Markdown; one progress bar on stderr."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Final, Literal, TypeAlias
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from math import degrees, inf
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import typer
 from rich.cells import cell_len
 from rich.console import Console, Group
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from aeroloop.protocol.wire.attitude import angle
+
+if TYPE_CHECKING:
+    from aeroloop.service.config import Settings
+    from aeroloop.service.testing.process_group import ProcessGroup
+
 Row: TypeAlias = dict[str, str]
-Format: TypeAlias = Literal["terminal", "markdown"]
 
 Sheets: TypeAlias = Iterable[tuple[str, Sequence[Row]]]
 """Tables, each with its title, and paragraphs, which are titles without rows."""
@@ -26,28 +36,26 @@ STYLES: Final = {
 """In a terminal, of cells with these texts."""
 _PIPE_WIDTH: Final = 160
 _GAP: Final = 2
+_LINE_S: Final = 10.0
 
 
-def show(rows: Sequence[Row], title: str = "", form: Format = "terminal", keys: int = 1) -> None:
+def show(rows: Sequence[Row], title: str = "", keys: int = 1) -> None:
     """Print rows, all with the same columns, below a title; without rows the title is a paragraph.
 
     So many first columns (`keys`) name a row: each block has them where a terminal is too narrow for all columns.
     """
-    if form == "markdown":
-        typer.echo(markdown([(title, rows)]))
-    else:
-        console = Console()
-        if not console.is_terminal:
-            console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
-        console.print(drawn(rows, title, console.width, keys), soft_wrap=not console.is_terminal and not rows)
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, _PIPE_WIDTH)  # folded lines cannot be unfolded in a file
+    console.print(drawn(rows, title, console.width, keys), soft_wrap=not console.is_terminal and not rows)
 
 
-def show_all(sheets: Sheets, form: Format = "terminal", keys: int = 1) -> None:
+def show_all(sheets: Sheets, keys: int = 1) -> None:
     """Print tables and paragraphs, with a line between them."""
     for i, (title, rows) in enumerate(sheets):
         if i:
             typer.echo("")
-        show(rows, title, form, keys)
+        show(rows, title, keys)
 
 
 def markdown(sheets: Sheets) -> str:
@@ -105,3 +113,42 @@ def _least(rows: Sequence[Row], name: str, available: int) -> int:
     folding = [text for text in cells if cell_len(text) > available / 3]
     whole = [] if folding else cells
     return max(map(cell_len, (*whole, *(word for text in (name, *folding) for word in text.split()), "")))
+
+
+# ── progress ──
+
+
+@contextmanager
+def progress_bar(title: str, total: float | None = None, *, hidden: bool = False) -> Iterator[Callable[..., None]]:
+    """A bar, updated by the yielded `update(done, total, title)`; what is None stays.
+
+    Where stderr is no terminal, a share (`total` is 1) is a line every 10 s instead.
+    """
+    console = Console(stderr=True)
+    line_due = inf if hidden or total != 1 or console.is_terminal else time.monotonic() + _LINE_S
+    columns = TextColumn("{task.description}", markup=False), BarColumn(20), TaskProgressColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as progress:
+        task = progress.add_task(title, total=total)
+
+        def update(done: float | None = None, total: float | None = None, title: str | None = None) -> None:
+            nonlocal line_due
+            progress.update(task, completed=done, total=total, description=title)
+            if time.monotonic() >= line_due:
+                line_due = time.monotonic() + _LINE_S
+                now = progress.tasks[0]
+                sys.stderr.write(f"aeroloop: {now.description}, {now.percentage:.0f} %\n")
+
+        yield update
+
+
+def demo_progress(settings: Settings, update: Callable[..., None]) -> Callable[[str, ProcessGroup], None]:
+    """Update a bar with what the demo waits for, and from the first command on with time and error."""
+
+    def show(waiting_for: str, now: ProcessGroup) -> None:
+        if waiting_for or now.telemetry is None:
+            update(title=f"waiting for {waiting_for}")
+        else:
+            error = degrees(angle(*now.telemetry.attitude_error))
+            update(now.telemetry.tick * settings.loop.period, title=f"error {error:5.2f}°")
+
+    return show

@@ -1,4 +1,4 @@
-"""Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper, and both sides of each at given states.
+"""Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper, and its error coordinates.
 
 `Known`, `Lemma` and `Theorem` hold each quantity's symbol, equation, unit and meaning; a certificate prints them. The
 paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here. README.md says how the
@@ -12,9 +12,7 @@ from math import cos, pi, sin, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Floats
 
 
@@ -91,24 +89,25 @@ class Theorem:
 def lemma_1(p: Known) -> Lemma:
     """The δ of Lemma 1."""
     delta_q = attitude_error(p.delta_eps, min(pi / 2, p.half_angle_d + p.half_angle_e))  # (C.31), (C.33)
-    k_omega_e = sqrt(1 + p.C1_max**2)  # (C.26)
-    delta_R = 2 * (delta_q + delta_q**2)  # (C.61)
-    delta_omega_e = delta_R * p.k_omega_d + p.delta_omega  # (C.58)
+    k_omega_e = sqrt(1 + p.C1_max**2)  # (C.26), (C.27)
+    delta_R = 2 * (delta_q + delta_q**2)  # (C.53), (C.61)
+    delta_omega_e = delta_R * p.k_omega_d + p.delta_omega  # (C.50), (C.58)
     return Lemma(
         delta_q=delta_q,
         k_eps=delta_q / p.delta_eps if p.delta_eps else 1.0,
         k_omega_e=k_omega_e,
         delta_R=delta_R,
         delta_omega_e=delta_omega_e,
-        delta_z1=delta_q,  # (C.60)
-        delta_z2=delta_omega_e + p.C1_max * delta_q,  # (C.59)
-        delta_Psi1=p.lambda_J * (2 * p.k_omega_d * p.delta_omega + p.delta_omega**2) + p.weight * delta_R,  # (C.62)
+        delta_z1=delta_q,  # (C.52), (C.60)
+        delta_z2=delta_omega_e + p.C1_max * delta_q,  # (C.51), (C.59)
+        delta_Psi1=p.lambda_J * (2 * p.k_omega_d * p.delta_omega + p.delta_omega**2)
+        + p.weight * delta_R,  # (C.54), (C.62)
         delta_Psi2=2 * p.lambda_J * p.delta_omega * k_omega_e,  # (C.62)
-        delta_S1=p.k_omega_d * delta_R + p.delta_omega,  # (C.63)
+        delta_S1=p.k_omega_d * delta_R + p.delta_omega,  # (C.55), (C.63)
         delta_S2=k_omega_e * delta_R,  # (C.63)
-        delta_alpha1=p.C1_max * delta_omega_e / 2,  # (C.64)
+        delta_alpha1=p.C1_max * delta_omega_e / 2,  # (C.56), (C.64)
         delta_alpha2=p.C1_max * delta_q * k_omega_e / 2,  # (C.64)
-        delta_Phi=p.delta_omega,  # (C.65)
+        delta_Phi=p.delta_omega,  # (C.57), (C.65)
         delta_Bu=p.delta_u * p.norm_B,  # (C.75)
     )
 
@@ -142,33 +141,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     return Theorem(c0, delta_V1, delta_theta1, delta_theta2, delta_V2, delta_Q, delta_Qdist, margin, radius)
 
 
-# ── Lemma 1 sample by sample: both sides of each inequality, for true and received states ──
-
-
-class Samples(NamedTuple):
-    """True states of the body and the states as received, at n instants; rates in rad/s."""
-
-    q: Floats  # true attitude, of either sign, (n, 4)
-    omega: Floats  # true ω, body frame, (n, 3)
-    q_Q: Floats  # attitude as received, scaled by Remark 2, with the sign chosen by the law, (n, 4)
-    omega_Q: Floats  # ω as received, (n, 3)
-    q_d: Floats  # desired attitude, (n, 4)
-    omega_d: Floats  # ω_d, inertial frame, (n, 3)
-    sign: Floats  # ±1, the equilibrium approached, (n,)
-
-
-class Inequality(NamedTuple):
-    """One inequality at n instants: its number, its left-hand side in the paper's symbols, both sides (n,)."""
-
-    equation: str
-    what: str
-    left: Floats
-    right: Floats
-
-    @property
-    def broken(self) -> NDArray[np.bool_]:
-        """Where it does not hold, beyond rounding. Shape (n,)."""
-        return self.left > self.right * (1 + 1e-9) + 1e-12
+# ── error coordinates at n instants ──
 
 
 class Coordinates(NamedTuple):
@@ -188,7 +161,16 @@ class Coordinates(NamedTuple):
 
 
 def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Floats, C1: Floats) -> Coordinates:
-    """z₁, z₂ and their parts; arguments as in `Samples`, C1 the gain's diagonal, (3,) or (n, 3)."""
+    """z₁, z₂ and their parts.
+
+    Args:
+        q: Attitude. Shape (n, 4).
+        omega: ω, body frame [rad/s]. Shape (n, 3).
+        q_d: Desired attitude. Shape (n, 4).
+        omega_d: ω_d, inertial frame [rad/s]. Shape (n, 3).
+        sign: ±1, the equilibrium that is approached. Shape (n,).
+        C1: The gain's diagonal. Shape (3,) or (n, 3).
+    """
     s = sign[:, None]
     eta, eps, eta_d, eps_d = q[:, :1], q[:, 1:], q_d[:, :1], q_d[:, 1:]
     eta_e = eta_d * eta + (eps_d * eps).sum(axis=1, keepdims=True)  # (C.16), (C.32)
@@ -198,40 +180,6 @@ def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Fl
     z1 = np.concatenate([1 - s * eta_e, eps_e], axis=1)  # (C.19), (C.39)
     z2 = omega_e + s * C1 * eps_e  # (C.19), (C.40); G z₁ = ±ε̃ by (C.49)
     return Coordinates(R, omega_e, eps_e, eta_e[:, :, None] * np.identity(3) + skew(eps_e), z1, z2)
-
-
-def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lemma) -> list[Inequality]:
-    """Both sides of the premises (C.28), (C.29), of (C.26), (C.27) and of every inequality of Lemma 1."""
-    C1, J = np.array(law.C1), np.array(law.inertia)
-    r_g, f_g = np.array(law.centre_of_mass), np.array([0.0, 0.0, -law.mass * law.gravity])
-    x = samples
-    q = x.q * np.where((x.q * x.q_Q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # q and −q are the same attitude
-    b = coordinates(q, x.omega, x.q_d, x.omega_d, x.sign, C1)
-    Q = coordinates(x.q_Q, x.omega_Q, x.q_d, x.omega_d, x.sign, C1)
-    z = b.norm
-
-    def Psi(omega: Floats, R: Floats) -> Floats:  # noqa: N802  # the paper's letter
-        return np.asarray(-np.cross(omega, J * omega) + np.cross(r_g, times(R, f_g)))  # (C.43), (C.45)
-
-    alpha_dot, alpha_bar = (-x.sign[:, None] / 2 * C1 * times(c.A, c.omega_e) for c in (b, Q))  # (C.46)
-    S_error = skew(x.omega) @ b.R - skew(x.omega_Q) @ Q.R
-    sides: dict[str, tuple[str, Floats, Floats | float]] = {  # premises (C.28), (C.29), then (C.26), (C.27) and Lemma 1
-        "C.28": ("‖ε^Q − ε‖", (x.q_Q - q)[:, 1:], p.delta_eps),  # (C.28)
-        "C.29": ("‖ω^Q − ω‖", x.omega_Q - x.omega, p.delta_omega),  # (C.29)
-        "C.26": ("‖ω_e‖", b.omega_e, d.k_omega_e * z),  # (C.26)
-        "C.27": ("‖ω‖", x.omega, d.k_omega_e * z + p.k_omega_d),  # (C.27)
-        "C.50": ("‖ω_e^Q − ω_e‖", Q.omega_e - b.omega_e, d.delta_omega_e),  # (C.50)
-        "C.51": ("‖z₂^Q − z₂‖", Q.z2 - b.z2, d.delta_z2),  # (C.51)
-        "C.52": ("‖G z₁ − G^Q z₁^Q‖", b.eps_e - Q.eps_e, d.delta_z1),  # (C.52)
-        "C.53": ("‖R_i^Q − R_i^b‖", Q.R - b.R, d.delta_R),  # (C.53)
-        "C.54": ("‖Ψ − Ψ^Q‖", Psi(x.omega, b.R) - Psi(x.omega_Q, Q.R), d.delta_Psi1 + d.delta_Psi2 * z),  # (C.54)
-        "C.55": ("‖S(ω)R_i^b − S(ω^Q)R_i^Q‖", S_error, d.delta_S1 + d.delta_S2 * z),  # (C.55)
-        "C.56": ("‖ᾱ^Q − α̇‖", alpha_bar - alpha_dot, d.delta_alpha1 + d.delta_alpha2 * z),  # (C.56)
-        "C.57": ("‖Φ − Φ^Q‖", np.abs(x.omega_Q - x.omega).max(axis=1, keepdims=True), d.delta_Phi),  # (C.57)
-    }
-    return [
-        Inequality(n, what, norm(error), np.broadcast_to(most, z.shape)) for n, (what, error, most) in sides.items()
-    ]
 
 
 def skew(v: Floats) -> Floats:

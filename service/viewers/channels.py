@@ -1,9 +1,9 @@
 """Decoder of published messages into topics that Foxglove and Lichtblick show without any configuration.
 
-Sans-I/O; the one converter for `log live`, the recorder's decoded channels and `log export --format mcap`. Topics are
-under `/<vehicle>/`; poses, transforms, scene and log are Foxglove's messages, statuses and set-points the network's,
-the rest are the views of schemas.py, rounded far below a quantizer's step. The plant's trace rows give measurements,
-the controller's rows give commands, at the times of sending on their own wall clocks.
+Sans-I/O; the one converter for `log live` and the recorder's decoded channels. Topics are under `/<vehicle>/`;
+transforms, scene and log are Foxglove's messages, statuses and set-points the network's, the rest are the views of
+schemas.py, rounded far below a quantizer's step. The plant's trace rows give measurements, the controller's rows give
+commands, at the times of sending on their own wall clocks.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from math import degrees, nan, sqrt
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 from foxglove import messages as foxglove
 from pydantic import BaseModel, ValidationError
 
@@ -30,15 +29,12 @@ ROLES: Final = ("plant", "controller", "recorder")
 """Roles with a status topic."""
 
 _ATTITUDE, _STATUS = json_shape(Attitude), json_shape(Status)
-_POSE: Final = protobuf_shape(foxglove.PoseInFrame.get_schema())
 _TRANSFORM: Final = protobuf_shape(foxglove.FrameTransform.get_schema())
 SHAPES: Final = {
-    "pose": _POSE,
     "tf": _TRANSFORM,
     "measurement": _ATTITUDE,
     "command": json_shape(Voltages),
     "tracking": json_shape(Tracking),
-    "desired_pose": _POSE,
     "desired_tf": _TRANSFORM,
     "truth": _ATTITUDE,
     "setpoint": json_shape(Setpoint),
@@ -158,7 +154,9 @@ class Decoder:
         measured = attitude.received_quaternion(x, y, z, attitude.IDENTITY) if known else None
         p, q, r = map(wire.rate.level, codes[3:])
         shown: _Shown = {name: _attitude(measured, (p, q, r))}
-        return _encoded(vehicle, shown | (_posed("", vehicle, measured, at_ns) if measured else {}), at_ns)
+        if measured:
+            shown["tf"] = _turned(vehicle, measured, at_ns)
+        return _encoded(vehicle, shown, at_ns)
 
 
 def _encoded(vehicle: str, shown: _Shown, at_ns: int) -> list[Decoded]:
@@ -175,8 +173,8 @@ def _encoded(vehicle: str, shown: _Shown, at_ns: int) -> list[Decoded]:
 def _converted(message: Message, address: topics.Address, wire: _Wire | None, at_ns: int) -> _Shown:
     match message:
         case Telemetry():
-            pose = _posed("desired_", f"{address.vehicle}_desired", message.desired, at_ns)
-            return {"tracking": _tracking(message, wire), **pose}
+            desired = _turned(f"{address.vehicle}_desired", message.desired, at_ns)
+            return {"tracking": _tracking(message, wire), "desired_tf": desired}
         case Truth():
             return {"truth": _attitude(message.attitude, message.rate)}
         case Setpoint():
@@ -198,14 +196,11 @@ def _converted(message: Message, address: topics.Address, wire: _Wire | None, at
 
 def _tracking(message: Telemetry, wire: _Wire | None) -> BaseModel:
     x, y, z = message.attitude_error
-    scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
     (sign,) = message.state.get("sign", (None,))[:1]
     damping = [*message.state.get("damping_estimate", ()), nan, nan, nan][:3]
-    measured = _product(message.desired, (-scalar if sign == -1 else scalar, x, y, z))  # q = q_d ⊗ e of (C.16)
     values = (
         None if wire is None else round(message.tick * wire.period, 6),
         _degree(attitude.angle(x, y, z)),
-        *map(_degree, attitude.to_euler(measured)),
         *map(_degree, attitude.to_euler(message.desired)),
         *map(_degree, message.rate_error),
         *(round(theta, 6) for theta in damping),
@@ -231,13 +226,6 @@ def _voltages(wire: _Wire, codes: Sequence[float]) -> BaseModel:
     return Voltages(**volts, **{f"saturated_{i}": abs(u) >= wire.voltage.outermost for i, u in levels.items()})
 
 
-def _product(p: attitude.Quaternion, q: attitude.Quaternion) -> attitude.Quaternion:
-    """Hamilton product p ⊗ q."""
-    (a, *v), (b, *u) = p, q
-    x, y, z = (a * np.array(u) + b * np.array(v) + np.cross(v, u)).tolist()
-    return a * b - float(np.dot(v, u)), x, y, z
-
-
 def _timestamp(at_ns: int) -> foxglove.Timestamp:
     """A time since 1970 [ns] in Foxglove's type, which has 32 bits of seconds."""
     seconds, rest = divmod(at_ns, 1_000_000_000)
@@ -248,14 +236,12 @@ def _logged(level: foxglove.LogLevel, name: str, text: str, at_ns: int) -> _Show
     return {"log": foxglove.Log(timestamp=_timestamp(at_ns), level=level, message=text, name=name)}
 
 
-def _posed(prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> _Shown:
-    """An attitude as a pose in the world, and as the transform from the world to a frame."""
-    at, turned, here = _timestamp(at_ns), foxglove.Quaternion(w=q[0], x=q[1], y=q[2], z=q[3]), foxglove.Vector3()
-    pose = foxglove.PoseInFrame(timestamp=at, frame_id=WORLD, pose=foxglove.Pose(position=here, orientation=turned))
-    transform = foxglove.FrameTransform(
-        timestamp=at, parent_frame_id=WORLD, child_frame_id=frame, translation=here, rotation=turned
+def _turned(frame: str, q: attitude.Quaternion, at_ns: int) -> foxglove.FrameTransform:
+    """An attitude as the transform from the world to a frame."""
+    turn, here = foxglove.Quaternion(w=q[0], x=q[1], y=q[2], z=q[3]), foxglove.Vector3()
+    return foxglove.FrameTransform(
+        timestamp=_timestamp(at_ns), parent_frame_id=WORLD, child_frame_id=frame, translation=here, rotation=turn
     )
-    return {f"{prefix}pose": pose, f"{prefix}tf": transform}
 
 
 # ── the 3-D scene: two rotors on a beam over a stand for the Aero, a box with a nose otherwise ──

@@ -9,7 +9,8 @@ loop.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from threading import Event
 from typing import Final
@@ -33,44 +34,40 @@ class FoxgloveServerError(AeroloopError):
     """The server cannot be started; one line with the reason and a remedy."""
 
 
-class FoxgloveServer:
-    """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
+@contextmanager
+def listening(vehicle: str, address: str, port: int) -> Iterator[tuple[str, Callable[[Decoded], None]]]:
+    """A WebSocket server with a channel per topic: its URL, and a function that sends a message and never blocks.
 
-    Port 0 is any free one; clients connect to `url`. Raises FoxgloveServerError if it cannot listen there.
+    Port 0 is any free one. Raises FoxgloveServerError if it cannot listen there.
     """
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # no log line for each client
+    context = foxglove.Context()  # channels and server live as long
+    channels = {
+        topic: foxglove.Channel(
+            topic,
+            schema=foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema),
+            message_encoding=shape.message_encoding,
+            context=context,
+        )
+        for topic, shape in ((f"/{vehicle}/{name}", shape) for name, shape in SHAPES.items())
+    }
+    host = f"[{address}]" if ":" in address else address
+    try:
+        server = foxglove.start_server(
+            name=f"aeroloop {vehicle}", host=address, port=port, context=context, message_backlog_size=BACKLOG
+        )
+    except RuntimeError as error:
+        reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
+        text = f"cannot listen on {host}:{port}: {reason.lower()}; choose by --address and --port"
+        raise FoxgloveServerError(text) from None
 
-    def __init__(self, vehicle: str, address: str, port: int) -> None:
-        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # no log line for each client
-        self._context = context = foxglove.Context()  # channels and server live as long
-        self._channels = {
-            topic: foxglove.Channel(
-                topic,
-                schema=foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema),
-                message_encoding=shape.message_encoding,
-                context=context,
-            )
-            for topic, shape in ((f"/{vehicle}/{name}", shape) for name, shape in SHAPES.items())
-        }
-        host = f"[{address}]" if ":" in address else address
-        try:
-            self._server = foxglove.start_server(
-                name=f"aeroloop {vehicle}", host=address, port=port, context=context, message_backlog_size=BACKLOG
-            )
-        except RuntimeError as error:
-            reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
-            text = f"cannot listen on {host}:{port}: {reason.lower()}; choose by --address and --port"
-            raise FoxgloveServerError(text) from None
-        self.url = f"ws://{host}:{self._server.port}"
+    def send(message: Decoded) -> None:
+        channels[message.topic].log(message.data, log_time=message.at_ns)
 
-    def __enter__(self) -> FoxgloveServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.stop()
-
-    def send(self, message: Decoded) -> None:
-        """Send a message to the clients that subscribe to its topic. Never blocks."""
-        self._channels[message.topic].log(message.data, log_time=message.at_ns)
+    try:
+        yield f"ws://{host}:{server.port}", send
+    finally:
+        server.stop()
 
 
 def serve(
@@ -89,13 +86,13 @@ def serve(
     decoder = Decoder(None)  # what is taken is bounded
     shown = [topic for topic in topics.TOPICS.values() if topic.decoded or topic.kind == "frame"]
     rooms = {topics.key(topic.name, vehicle): ROOM if topic.decoded == "always" else 1 for topic in shown}
-    with FoxgloveServer(vehicle, address, port) as outlet, join(network, listen=False) as session:
+    with listening(vehicle, address, port) as (url, send), join(network, listen=False) as session:
         descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
         rings = [(session.declare_subscriber(key, RingChannel(room)), room) for key, room in rooms.items()]
-        ready(outlet.url)
+        ready(url)
         while not stop.wait(1 / rate_hz):
             taken = [sample for ring, room in rings for sample in islice(iter(ring.try_recv, None), room)]
             for received in (*descriptions.take(), *map(read_sample, taken)):
                 if topic := topics.read_key(received.key):
                     for message in decoder.take(topic, received.payload, received.published_ns):
-                        outlet.send(message)
+                        send(message)

@@ -99,12 +99,12 @@ Voltages: Final = _view(
 """Voltages as commanded, quantized, and whether each is at the outermost level; null: no valid value, or no motor."""
 Tracking: Final = _view(
     "Tracking",
-    "time_s error_deg roll_deg pitch_deg yaw_deg desired_roll_deg desired_pitch_deg desired_yaw_deg "
+    "time_s error_deg desired_roll_deg desired_pitch_deg desired_yaw_deg "
     "error_p_deg_s error_q_deg_s error_r_deg_s damping_1 damping_2 damping_3",
     sign=int,
 )
-"""The controller at one tick: the law's time, the angle of the error, the attitude as measured and as desired, ω_e,
-θ̂ of the paper's law [N·m·s/rad], and the sign of the equilibrium that it approaches."""
+"""The controller at one tick: the law's time, the angle of the error, the desired attitude, ω_e, θ̂ of the paper's law
+[N·m·s/rad], and the sign of the equilibrium that it approaches."""
 
 
 # ── panels ──

@@ -40,7 +40,7 @@ def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_re
     judged = json.loads(aeroloop("log", "review", str(log), "--json"))
     figures = {name: judged[name] for name in demo}
     figures["reasons"] = {name: why for name, why in judged["reasons"].items() if name in demo}
-    assert figures == demo  # which has no age and holds nothing against the theorem
+    assert figures == demo  # which holds nothing against the theorem
 
 
 def batches(log: Path) -> int:

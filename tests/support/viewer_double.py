@@ -63,9 +63,8 @@ def quaternion(data: bytes) -> Quaternion:
     return w, x, y, z
 
 
-def orientation(pose_in_frame: bytes) -> Quaternion:
-    pose = fields(fields(pose_in_frame)[3][0])
-    return quaternion(pose[2][0])
+def orientation(frame_transform: bytes) -> Quaternion:
+    return quaternion(fields(frame_transform)[5][0])
 
 
 class Shown(NamedTuple):

@@ -70,7 +70,7 @@ def test_a_daemon_that_is_terminated_while_zenoh_is_opened_ends_at_once_and_says
 
 TERMINATED_IN_WAIT = """
 import os, signal, sys, threading
-from aeroloop.service.cli.processes import run_alone
+from aeroloop.service.cli.entry import run_alone
 
 def trace(frame, event, _):
     if frame.f_code is threading.Condition.wait.__code__:  # the event's lock is held

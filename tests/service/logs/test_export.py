@@ -1,4 +1,4 @@
-"""Export: the same ticks and numbers as the review in every format, null for missing values, and decoded logs."""
+"""Export: the same ticks and numbers as the review in every format, null for missing values, and copies of logs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from aeroloop.protocol.messages.models import Event, Truth
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.columns import columns_of
-from aeroloop.service.logs.export import ExportError, export
-from aeroloop.service.logs.recording import Recording
+from aeroloop.service.logs.copies import ExportError, copy
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.session import Truths
 from aeroloop.service.review.review import read, review
-from aeroloop.service.viewers.channels import Decoder
 from tests.golden.make import HERE as GOLDEN
-from tests.support.edited_log import PERIOD_NS, Said, at_rest, by_mcap, contents, rewrite
-from tests.support.made_log import SESSION, START_NS, VEHICLE, made, make_log, write
+from tests.support.edited_log import PERIOD_NS, at_rest, by_mcap
+from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
 
 TICKS = 400
 SKIPPED = range(100, 148)
@@ -120,7 +120,7 @@ def test_an_event_is_cut_out_of_a_log_with_the_seconds_beside_it(tmp_path: Path)
         messages.insert(messages.index(first), first._replace(key=key, payload=event.encode()))
     write(tmp_path / "run.mcap", settings, messages)
     assert len(export([tmp_path / "run.mcap"], "csv", tmp_path / "b.csv", around=("mark", 1)).around) == 2
-    exported = export([tmp_path / "run.mcap"], "mcap", tmp_path / "cut.mcap", around=("gust", 1))
+    exported = copy([tmp_path / "run.mcap"], tmp_path / "cut.mcap", around=("gust", 1))
     assert exported.around == ["gust seen"]
     cut = read(tmp_path / "cut.mcap")  # a log that is whole enough to be judged, and has no more than it must
     assert cut.ticks.k[0] <= at - 500 < at + 450 <= cut.ticks.k[-1] <= at + 500
@@ -162,7 +162,8 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     ticks.attitude[:2] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0)
     ticks.rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
     ticks.voltages[:] = (top["voltage"], -top["voltage"]), (nan, nan), (0.99 * top["voltage"], 0.0)
-    columns = columns_of((VEHICLE, SESSION), ticks, np.zeros((3, 10)), settings)
+    truths = Truths(np.arange(3), np.zeros((3, 4)), np.zeros((3, 3)), np.zeros((3, 2)))
+    columns = columns_of((VEHICLE, SESSION), ticks, truths, settings)
     found = {column.name[10:]: list(column.values) for column in columns if column.name.startswith("saturated")}
     expected = {
         "attitude_x": [1, nan, 0], "attitude_y": [1, nan, 0], "attitude_z": [0, nan, 0],
@@ -204,26 +205,16 @@ def test_every_column_names_its_unit_and_the_file_its_configuration(
     assert facts["aeroloop.sessions"] == [f"{VEHICLE}/{SESSION}"]
 
 
-@pytest.mark.parametrize(
-    ("session", "exported", "other"),
-    [("1", [SESSION], SHORT), ("2", [SHORT], SESSION), ("all", [SESSION, SHORT], None)],
-)
-def test_the_sessions_that_are_asked_for_are_exported_and_the_others_are_named(
-    log: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    session: str,
-    exported: list[str],
-    other: str | None,
+@pytest.mark.parametrize(("session", "exported", "other"), [("1", SESSION, SHORT), ("2", SHORT, SESSION)])
+def test_the_session_that_is_asked_for_is_exported_and_the_others_are_named(
+    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], session: str, exported: str, other: str
 ) -> None:
     out, ticks = tmp_path / "a.csv", {SESSION: [k for k in range(TICKS) if k not in SKIPPED], SHORT: list(range(50))}
     assert execute(["log", "export", str(log), "--format", "csv", "--out", str(out), "--session", session]) == 0
     with out.open(newline="") as file:
         found = [(row["session"], int(row["tick"])) for row in csv.DictReader(file)]
-    assert found == [(name, k) for name in exported for k in ticks[name]]
-    printed = capfd.readouterr().out
-    assert (f"not exported of this log: {VEHICLE}/{other};" in printed) == bool(other)
-    assert ("not exported" in printed) == bool(other)
+    assert found == [(exported, k) for k in ticks[exported]]
+    assert f"not exported of this log: {VEHICLE}/{other};" in capfd.readouterr().out
 
 
 def test_an_export_that_fails_is_one_line_and_leaves_nothing_behind(
@@ -244,33 +235,21 @@ def test_an_export_that_fails_is_one_line_and_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-# Decoded logs
+# Copies of logs
 
 
-def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decoded(tmp_path: Path) -> None:
-    """Also where the recorder has decoded some already: those are made again, not doubled."""
-    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
-    make_log(log, TICKS, settings=load())
-    raw, descriptions = by_mcap(log), Recording([log]).descriptions
-    decoder = Decoder(rate_hz=10)
-    for description in descriptions.values():
-        decoder.configure(description)
-    decoded = [
-        Said(one.topic, one.at_ns, one.data)
-        for message in contents(log)[0]
-        if (address := topics.read_key(message.key)) is not None
-        for one in decoder.take(address, message.data, message.published_ns)
-    ]
-    assert decoded
-    exported = export([rewrite(log, tmp_path / "recorded.mcap", more=decoded)], "mcap", out)
-    found = by_mcap(out)
-    assert exported.rows == len(found)
-    assert sorted((m.topic, m.log_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
-        (m.topic, m.log_time, m.data) for m in raw
+def test_a_copy_of_a_rotated_run_is_one_log_that_reads_the_same_alone_and_beside_it(tmp_path: Path) -> None:
+    settings, folder = load(), tmp_path / "run"
+    folder.mkdir()
+    messages = made(settings, TICKS)
+    parts = [write(folder / f"run-{i:04}.mcap", settings, messages[i::2]) for i in range(2)]
+    exported = copy([folder])
+    assert (exported.out, exported.sessions) == (str(tmp_path / "run-copy.mcap"), None)
+    assert sorted(message.data for message in by_mcap(Path(exported.out))) == sorted(
+        message.data for part in parts for message in by_mcap(part)
     )
-    for name in ("measurement", "pose", "command"):
-        assert len([m for m in found if m.topic == f"/{VEHICLE}/{name}"]) == TICKS
-    assert Recording([out]).descriptions == descriptions
-    assert review(out).z_track == review(log).z_track
-    with pytest.raises(ExportError, match="--session"):
-        export([log], "mcap", tmp_path / "other.mcap", session=SESSION)
+    assert review(Path(exported.out)).z_track == review(folder).z_track
+    (folder / "copy.mcap").write_bytes(Path(exported.out).read_bytes())
+    unlike = {"log"}
+    assert review(folder).model_dump(exclude=unlike) == review(*parts).model_dump(exclude=unlike)
+    assert execute(["log", "export", str(folder), "--format", "mcap", "--session", SESSION]) == 2

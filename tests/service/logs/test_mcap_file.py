@@ -1,4 +1,4 @@
-"""Broken log files: whole records are read and recovered, damage is named, and forged sizes cost no memory."""
+"""Broken log files: whole records are read and copied, damage is named, and forged sizes cost no memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcap.records import Channel, Chunk, Message
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.logs.copies import RecoverError, recover
+from aeroloop.service.logs.copies import ExportError, copy
 from aeroloop.service.logs.mcap_file import MAX_CHUNK, records
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recording import Recording, ReviewError
@@ -57,13 +57,13 @@ def everything(whole: Path) -> list[Read]:
     return by_mcap(whole)
 
 
-def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
+def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_copied_whole(
     whole: Path, everything: list[Read], tmp_path: Path
 ) -> None:
     damages: list[str] = []
     assert read(whole, damages) == everything
     assert damages == []
-    assert recover(whole, tmp_path / "out.mcap").lost == []
+    assert copy([whole], tmp_path / "out.mcap").damages == []
     assert by_mcap(tmp_path / "out.mcap") == everything
     assert Recording([tmp_path / "out.mcap"]).descriptions == Recording([whole]).descriptions
 
@@ -71,7 +71,7 @@ def test_a_whole_file_gives_what_mcaps_own_reader_has_and_is_recovered_whole(
 def test_a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut_and_says_up_to_when(
     whole: Path, everything: list[Read], tmp_path: Path
 ) -> None:
-    """And so does what is recovered of it, by an index."""
+    """And so does a copy of it, by an index."""
     data, cut, out, rng = whole.read_bytes(), tmp_path / "cut.mcap", tmp_path / "out.mcap", random.Random(11)
     ends = [chunk.end for chunk in chunks(data)]
     data_end = next(part.end for part in parts(data[: -len(MAGIC)], len(MAGIC)) if part.opcode == Opcode.DATA_END)
@@ -87,12 +87,12 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut_and_says_up_
         if damages and got:
             assert after(got) in damages[0]
         if got:
-            assert recover(cut, out).lost == damages
+            assert copy([cut], out).damages == [f"{cut}: {damage}" for damage in damages]
             assert by_mcap(out) == got
             out.unlink()
         else:
-            with pytest.raises(RecoverError):
-                recover(cut, out)
+            with pytest.raises(ExportError, match="no whole message"):
+                copy([cut], out)
             assert not out.exists()
 
 
@@ -133,7 +133,7 @@ def test_a_log_of_a_killed_recorder_is_read_up_to_the_damage(
     assert got == everything[: len(got)] != []
     (damage,) = damages
     assert f"(byte {damaged.offset}, {after(got)})" in damage
-    assert recover(killed, tmp_path / "out.mcap").lost == damages
+    assert copy([killed], tmp_path / "out.mcap").damages == [f"{killed}: {damage}"]
 
 
 def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_word(tmp_path: Path) -> None:
@@ -172,18 +172,18 @@ def test_no_cut_or_flipped_file_gives_a_traceback_or_another_figure_without_a_wo
 def test_what_is_no_log_or_stands_in_the_way_is_reported_in_one_line(whole: Path, tmp_path: Path) -> None:
     for content in (b"", b"something else", MAGIC):
         (tmp_path / "a.mcap").write_bytes(content)
-        for verb, error in ((review, ReviewError), (lambda path: recover(path, tmp_path / "out"), RecoverError)):
-            with pytest.raises(error) as refused:
+        for verb in (review, lambda path: copy([path], tmp_path / "out")):
+            with pytest.raises((ReviewError, ExportError)) as refused:
                 verb(tmp_path / "a.mcap")
             assert len(str(refused.value).splitlines()) == 1
             assert not (tmp_path / "out").exists()
     (tmp_path / "empty").mkdir()
     with pytest.raises(ReviewError, match=r"no \.mcap file"):
         Recording([tmp_path / "empty"])
-    with pytest.raises(RecoverError, match="No such file"):
-        recover(tmp_path / "none.mcap", tmp_path / "out")
+    with pytest.raises(ReviewError, match="No such file"):
+        copy([tmp_path / "none.mcap"], tmp_path / "out")
     with pytest.raises(OutputError, match="is an input"):
-        recover(whole, whole)
+        copy([whole], whole)
 
 
 # What a file claims

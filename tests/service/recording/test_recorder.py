@@ -186,7 +186,7 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert {key: running.of(key) for key in published} == published
         assert running.losses() == []
         assert descriptions(parts(running.path)[-1])[DESCRIPTION] == published[DESCRIPTION][0]
-        assert 0 < len(running.of("/aero/pose")) <= 11  # of a second; rows before the description are not decoded
+        assert 0 < len(running.of("/aero/tf")) <= 11  # of a second; rows before the description are not decoded
 
 
 def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:

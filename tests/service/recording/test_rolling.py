@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from mcap.records import Attachment, Channel, Message
 
 from aeroloop.protocol.transport.history import Delivery
-from aeroloop.service.logs.copies import recover
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, records, with_checksum
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError, RollingLog, parts
@@ -217,19 +216,19 @@ def test_a_file_that_is_removed_to_make_room_gives_its_room_back(tmp_path: Path,
     assert run.log.trouble
 
 
-def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_recovered(tmp_path: Path, disk: Disk) -> None:
+def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_read(tmp_path: Path, disk: Disk) -> None:
     run = Run(tmp_path / "a.mcap")
     run.take(250)
     disk.room = (tmp_path / "a.mcap").stat().st_size
     with pytest.raises(RecorderError) as refused:
         run.log.close(waiting=3)
-    recover(tmp_path / "a.mcap", tmp_path / "recovered")
-    kept = numbers(tmp_path / "recovered")
+    kept = numbers(tmp_path / "a.mcap")
     assert 0 < len(kept) < 250
     assert kept == list(range(len(kept)))
     assert str(refused.value) == (
         f"{250 - len(kept) + 3} messages and the index of {tmp_path / 'a.mcap'} could not be written: "
-        f"{os.strerror(errno.ENOSPC)}; what came before is whole, and `aeroloop log recover` gives it an index"
+        f"{os.strerror(errno.ENOSPC)}; what came before is whole, "
+        "and `aeroloop log export --format mcap` gives it an index"
     )
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from aeroloop.service.config import load
 from aeroloop.service.logs.recording import ReviewError
+from aeroloop.service.logs.session import Truths
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.events import Truths
 from aeroloop.service.review.panels import NO_TRUTHS, outline, panels_of
 from aeroloop.service.review.report import Line
 from aeroloop.service.review.review import read
@@ -66,7 +66,7 @@ def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_
         return np.column_stack([np.cos(halves), np.zeros((60, 2)), np.sin(halves)])
 
     ticks = at_rest(range(60), attitude=yawed(4), desired=yawed(0))
-    lines = drawn(ticks, Truths(ticks.k, yawed(5), np.zeros((60, 3))))
+    lines = drawn(ticks, Truths(ticks.k, yawed(5), np.zeros((60, 3)), np.zeros((60, 2))))
     for name, lag in (("desired", 0), ("measured", 4), ("true", 5)):
         np.testing.assert_allclose(lines["yaw", name].values, 10.0 * np.arange(60) - lag, atol=1e-6)
 

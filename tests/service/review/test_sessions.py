@@ -16,7 +16,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.mcap_file import RECORDER_METADATA
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.review.review import Comparison, read, read_runs, review
+from aeroloop.service.review.review import compared, read, read_runs, review
 from tests.support.edited_log import message_of, rewrite
 from tests.support.made_log import START_NS, VEHICLE, Logged, description, made, make_log, write
 
@@ -192,4 +192,4 @@ def test_logs_of_one_name_are_named_with_their_folders_or_by_number(logs: tuple[
         (tmp_path / folder / "log.mcap").write_bytes(Path(log).read_bytes())
     named = read_runs([tmp_path / "before/log.mcap", tmp_path / "after/log.mcap", tmp_path / "after/log.mcap"])
     assert [run.name for run in named] == ["before/log", "after/log", "after/log (2)"]
-    assert list(Comparison.of(named).runs) == [run.name for run in named]
+    assert list(compared(named)["runs"]) == [run.name for run in named]

@@ -11,7 +11,7 @@ from rich.console import Console
 from aeroloop.service.config import load
 from aeroloop.service.terminal import show as module
 from aeroloop.service.terminal.sheets import certificate_sheets
-from aeroloop.service.terminal.show import Row, show, show_all
+from aeroloop.service.terminal.show import Row, markdown, show, show_all
 from aeroloop.service.theorem.certificate import certify
 
 ROWS: list[Row] = [
@@ -48,11 +48,11 @@ def test_rows_into_a_pipe_are_not_folded_at_80_columns(capsys: pytest.CaptureFix
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
-def test_markdown_has_every_cell_and_numbers_but_no_sentences_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
+def test_markdown_has_every_cell_and_numbers_but_no_sentences_to_the_right() -> None:
     rows = [{"law": "pd", "kbit/s": "1.0", "kind": "8 bits, uniform"}, {"law": "2", "kbit/s": "–", "kind": "2 samples"}]
-    show_all([("laws", rows), ("a note", [])], "markdown")
+    text = markdown([("laws", rows), ("a note", [])])
     table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | 2 samples |"]
-    assert capsys.readouterr().out.splitlines() == ["**laws**", "", *table, "", "a note"]
+    assert text.splitlines() == ["**laws**", "", *table, "", "a note"]
 
 
 def test_a_certificate_shows_its_verdict_and_what_decides_and_on_request_every_term(

@@ -18,18 +18,11 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Floats, desired
-from aeroloop.service.theorem.bounds import (
-    Samples,
-    coordinates,
-    lemma_1,
-    lemma_inequalities,
-    rotation,
-    theorem_1,
-    times,
-)
+from aeroloop.service.theorem.bounds import coordinates, lemma_1, rotation, theorem_1, times
 from aeroloop.service.theorem.certificate import Paper, evaluate
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
+from tests.support.lemma import Samples, lemma_inequalities
 from tests.support.twin_body import body_of
 
 LAW = AdaptiveSettings(

@@ -22,7 +22,6 @@ from aeroloop.service.config import load
 from aeroloop.service.viewers.channels import SHAPES, Decoder
 from tests.support.decoded import (
     ATTITUDE,
-    BODY,
     NOW,
     PITCH,
     RAW,
@@ -43,7 +42,7 @@ from tests.support.decoded import (
     telemetry,
 )
 from tests.support.made_log import description
-from tests.support.viewer_double import fields, orientation, quaternion
+from tests.support.viewer_double import fields, orientation
 
 VOLTS = WIRE.voltage.quantizer()
 
@@ -51,25 +50,24 @@ VOLTS = WIRE.voltage.quantizer()
 # ── what is shown ──
 
 
-def test_a_measurement_is_shown_as_the_body_stood_to_within_a_quantizers_step_in_angles_pose_and_transform() -> None:
+def test_a_measurement_is_shown_as_the_body_stood_to_within_a_quantizers_step_in_angles_and_transform() -> None:
     payload = measurement(*sent_vector(ATTITUDE), 0.5, -0.25, 0.0)
     found = by_topic(configured().take(address("measurement"), payload, NOW))
-    assert set(found) == {"/aero/measurement", "/aero/pose", "/aero/tf"}
+    assert set(found) == {"/aero/measurement", "/aero/tf"}
     assert {message.at_ns for message in found.values()} == {NOW}
     shown = list(said(found["/aero/measurement"]).values())
     step_deg = degrees(4 * WIRE.attitude.quantizer().bound / ATTITUDE[0])  # an angle is twice ε/η
     assert shown[:3] == pytest.approx([degrees(angle) for angle in (ROLL, PITCH, YAW)], abs=step_deg)
     within = degrees(WIRE.rate.quantizer().bound)
     assert shown[3:] == pytest.approx([degrees(rate) for rate in (0.5, -0.25, 0.0)], abs=within)
-    pose, transform = found["/aero/pose"].data, fields(found["/aero/tf"].data)
-    assert (transform[2], transform[3]) == ([b"world"], [b"aero"])
-    assert quaternion(transform[5][0]) == orientation(pose)
-    assert shown[:3] == pytest.approx([degrees(part) for part in to_euler(orientation(pose))], abs=1e-4)
-    at = fields(fields(pose)[1][0])
+    transform = found["/aero/tf"].data
+    assert (fields(transform)[2], fields(transform)[3]) == ([b"world"], [b"aero"])
+    assert shown[:3] == pytest.approx([degrees(part) for part in to_euler(orientation(transform))], abs=1e-4)
+    at = fields(fields(transform)[1][0])
     assert (at[1], at.get(2, [0])) == ([NOW // 10**9], [0])
 
 
-def test_what_a_measurement_does_not_know_is_null_and_gives_no_pose() -> None:
+def test_what_a_measurement_does_not_know_is_null_and_gives_no_transform() -> None:
     decoder = configured()
     (shown,) = decoder.take(address("measurement"), measurement(0.1, None, 0.1, 0.5, None, 0.0), NOW)
     values = said(shown)
@@ -88,20 +86,20 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_tracking_has_the_measured_attitude_where_the_error_puts_it(sign: int) -> None:
-    error = about(2, radians(10.0))
-    wired: Quaternion = tuple(sign * part for part in quaternion_of(error))  # type: ignore[assignment]  # z₁₋: −e
+def test_tracking_has_the_error_and_the_desired_attitude_on_either_side(sign: int) -> None:
+    wired: Quaternion = tuple(  # type: ignore[assignment]  # z₁₋: −e
+        sign * part for part in quaternion_of(about(2, radians(10.0)))
+    )
     found = by_topic(configured().take(address("telemetry"), telemetry(wired, sign).encode(), NOW))
-    assert set(found) == {"/aero/tracking", "/aero/desired_pose", "/aero/desired_tf"}
+    assert set(found) == {"/aero/tracking", "/aero/desired_tf"}
     shown = said(found["/aero/tracking"])
     assert shown["error_deg"] == pytest.approx(10.0, abs=1e-4)
     assert shown["time_s"] == 0.5
-    for prefix, q in (("", quaternion_of(BODY * error)), ("desired_", ATTITUDE)):
-        for name, expected in zip(("roll", "pitch", "yaw"), to_euler(q), strict=True):
-            assert shown[f"{prefix}{name}_deg"] == pytest.approx(degrees(expected), abs=1e-3)
+    for name, expected in zip(("roll", "pitch", "yaw"), to_euler(ATTITUDE), strict=True):
+        assert shown[f"desired_{name}_deg"] == pytest.approx(degrees(expected), abs=1e-3)
     assert [shown["error_q_deg_s"], shown["error_r_deg_s"]] == [2.0, -3.0]
     assert [shown["damping_2"], shown["damping_3"], shown["sign"]] == [0.007, 0.0095, sign]
-    assert distance(orientation(found["/aero/desired_pose"].data), ATTITUDE) == pytest.approx(0.0, abs=1e-6)
+    assert distance(orientation(found["/aero/desired_tf"].data), ATTITUDE) == pytest.approx(0.0, abs=1e-6)
     assert fields(found["/aero/desired_tf"].data)[3] == [b"aero_desired"]
 
 
@@ -176,7 +174,7 @@ def test_frames_give_nothing_before_a_description_and_are_read_by_the_plants() -
         for one in descriptions:
             decoder.configure(one)
         found.append((len(decoder.take(address("measurement"), payload, NOW)), decoder.malformed))
-    assert found == [(0, 0), (0, 0), (0, 1), (3, 1)]
+    assert found == [(0, 0), (0, 0), (0, 1), (2, 1)]
     other_version = plant.model_copy(update={"protocol": 1, "config": {"wire": {"bits": 3}}})
     decoder.configure(other_version)
     assert decoder.malformed == 2
@@ -207,7 +205,7 @@ def test_of_the_rows_in_a_slot_of_time_the_first_is_given_however_they_are_batch
         one.at_ns
         for begin, end in pairwise(edges)
         for one in decoder.take(address("trace"), batch("plant", rows[begin:end]), 0)
-        if one.topic == "/aero/pose"
+        if one.topic == "/aero/tf"
     ]
     first = {at_ns // 10**8: at_ns for at_ns, *_ in reversed(rows)}
     assert shown == sorted(first.values())

@@ -17,7 +17,7 @@ from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES
-from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError
+from aeroloop.service.viewers.foxglove_server import FoxgloveServerError, listening
 from tests.support.decoded import ATTITUDE, RAW, STATUS, telemetry
 from tests.support.viewer_double import PATIENCE_S, Viewer
 
@@ -90,9 +90,9 @@ def test_a_loop_that_comes_after_its_viewers_is_shown_to_them_all() -> None:
         early.subscribe(*TOPICS)
         with loop(settings) as plant, Viewer(url) as late:
             late.await_topics(*TOPICS)
-            late.subscribe("/aero/pose", "/aero/tracking")
+            late.subscribe("/aero/tf", "/aero/tracking")
             for viewer in (early, late):
-                first, second = (viewer.first("/aero/pose").at_ns for _ in range(2))
+                first, second = (viewer.first("/aero/tf").at_ns for _ in range(2))
                 assert second > first
                 assert viewer.first("/aero/tracking").data
             plant.publish("event", Event(role="plant", kind="tripped", text="as it was asked to"))
@@ -105,7 +105,7 @@ def test_a_port_in_use_is_one_clear_line() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(FoxgloveServerError) as refused:
-            FoxgloveServer("aero", "127.0.0.1", port)
+        with pytest.raises(FoxgloveServerError) as refused, listening("aero", "127.0.0.1", port):
+            pass
     where = f"cannot listen on 127.0.0.1:{port}: address already in use"
     assert str(refused.value) == f"{where}; choose by --address and --port"
