@@ -58,7 +58,7 @@ def logs_of(paths: Sequence[Path]) -> list[list[Path]]:
         if not path.is_dir():
             found.append([path])
             continue
-        logs = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
+        logs = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-copy"))
         rotated = {part for log in logs for part in parts(log)[1:]}
         found += [parts(log) for log in logs if log not in rotated]
     if not found:
