@@ -104,7 +104,7 @@ def show_c(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Write the controller and a plant's node as C99 for firmware, with golden commands and a Makefile."""
+    """Write the controller and a plant's node as C99. With a Makefile and golden commands."""
     settings = load_for_loop(config, overrides)
 
     from aeroloop.service.firmware.export import export
@@ -123,7 +123,7 @@ def fmu(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Write the emulated plant, or the law between both quantizers, as an FMU for co-simulation (FMI 2.0)."""
+    """Write the emulated plant or the law as an FMU. For co-simulation by FMI 2.0; the law is between both quantizers."""
     settings = load_for_loop(config, overrides)
 
     from aeroloop.service.firmware.fmu import write_fmu
