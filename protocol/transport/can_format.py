@@ -50,6 +50,7 @@ class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     channel: str = Field(default="239.74.163.2", description="the interface's: can0, /dev/ttyACM0, a multicast group…")
     node: int = Field(default=1, ge=1, le=MAX_NODE, description="number of the plant on the bus")
     fd: bool = Field(default=False, description="CAN FD, which frames of more than 8 bytes need")
+    node_in_c: bool = Field(default=False, description="`aeroloop can-node` runs the firmware's C instead of Python")
     options: dict[str, Any] = Field(default={}, description="for the interface, such as bitrate = 1000000")
 
 

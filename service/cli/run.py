@@ -99,10 +99,15 @@ def plant(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command("can-node")
 def can_node(config: Config = None, overrides: Overrides = None) -> None:
-    """Run the emulated plant as a node on the CAN bus."""
+    """Run the emulated plant as a node on the CAN bus. It may be the firmware's C."""
     settings = load_settings(config, overrides)
 
     def run(stop: Event) -> None:
+        if settings.can.node_in_c:
+            from aeroloop.service.firmware import node
+
+            node.run(settings, stop)
+            return
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
         from aeroloop.plant_emulator.hosts.driver import Driver
 

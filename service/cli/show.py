@@ -123,7 +123,7 @@ def fmu(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Write the emulated plant or the law as an FMU. For co-simulation by FMI 2.0; the law is between both quantizers."""
+    """Write the emulated plant or the law as an FMU. For co-simulation by FMI 2.0; the law with both quantizers."""
     settings = load_for_loop(config, overrides)
 
     from aeroloop.service.firmware.fmu import write_fmu

@@ -7,7 +7,7 @@ from math import isinf
 
 from aeroloop.plant_emulator.endpoint.endpoint import Freshness
 from aeroloop.plant_emulator.endpoint.limits import LimitMonitor
-from aeroloop.protocol.transport.can_format import HEARTBEAT_S, SILENT_S, fingerprint
+from aeroloop.protocol.transport.can_format import HEARTBEAT_S, SILENT_S, carried_bytes, fingerprint
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import CodedQuantizer, LogarithmicQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec
@@ -32,6 +32,7 @@ def config_header(settings: Settings) -> str:
         ("COUNTER_BITS", wire.counter_bits, "of both frames"),
         ("COUNTERS", counters, "values of the counter"),
         ("MEASUREMENT_BYTES", wire.measurement.size, "of a frame"),
+        ("MEASUREMENT_CAN_BYTES", carried_bytes(wire.measurement.size), "of the CAN frame that carries it"),
         ("MEASUREMENT_GAP", _gap(wire.measurement), "zero bits after the counter"),
         ("COMMAND_BYTES", wire.command.size, "of a frame"),
         ("COMMAND_GAP", _gap(wire.command), "zero bits after the counter"),
@@ -44,20 +45,20 @@ def config_header(settings: Settings) -> str:
         ),
         ("WATCHDOG_TICKS", freshness.watchdog_ticks, "0 V after so many without a fresh command"),
         ("FIRST_COMMAND_TICKS", freshness.first_ticks, "0 V after so many without a session's first command"),
-        ("VOLTAGE_LIMIT", _exact(plant.voltage_limit), f"{plant.voltage_limit:g} V, of the supply"),
-        ("FULL_VOLTAGE", _exact(full), f"{full:g} V: from here on a motor counts as saturated"),
+        ("VOLTAGE_LIMIT", exact(plant.voltage_limit), f"{plant.voltage_limit:g} V, of the supply"),
+        ("FULL_VOLTAGE", exact(full), f"{full:g} V: from here on a motor counts as saturated"),
         (
             "LEAST_UPRIGHT",
-            _exact(limits.least_upright),
+            exact(limits.least_upright),
             f"cosine of {plant.limits.max_tilt_deg:g} deg, the largest tilt",
         ),
-        ("MAX_RATE", _exact(plant.limits.max_rate), f"{plant.limits.max_rate:g} rad/s"),
+        ("MAX_RATE", exact(plant.limits.max_rate), f"{plant.limits.max_rate:g} rad/s"),
         (
             "MAX_SATURATED_S",
-            _exact(plant.limits.max_saturated_s),
+            exact(plant.limits.max_saturated_s),
             f"{plant.limits.max_saturated_s:g} s at full voltage",
         ),
-        ("MAX_INVALID_S", _exact(plant.limits.max_invalid_s), f"{plant.limits.max_invalid_s:g} s without valid values"),
+        ("MAX_INVALID_S", exact(plant.limits.max_invalid_s), f"{plant.limits.max_invalid_s:g} s without valid values"),
         ("CAN_NODE", can.node, "number of the plant on the bus"),
         ("CAN_FD", int(can.fd), "CAN FD, which frames of more than 8 bytes need"),
         ("CAN_HEARTBEAT_NS", round(HEARTBEAT_S * 1e9), "from heartbeat to heartbeat [ns]"),
@@ -81,7 +82,8 @@ def config_header(settings: Settings) -> str:
     return "\n".join([*lines, ""])
 
 
-def _exact(value: float) -> str:
+def exact(value: float) -> str:
+    """A number as C's literal, in every bit."""
     return "HUGE_VAL" if isinf(value) else value.hex()
 
 
@@ -99,12 +101,12 @@ def _quantizer(name: str, signal: SignalSpec, unit: str) -> Iterator[str]:
     ]
     for length in _LENGTHS:
         if (value := getattr(quantizer, length, None)) is not None:
-            members.append((f".{length}", _exact(value), f"{value:.9g} {unit}"))
+            members.append((f".{length}", exact(value), f"{value:.9g} {unit}"))
     if isinstance(quantizer, CodedQuantizer):
         members.append((".top", quantizer.top, "outermost code"))
     if isinstance(quantizer, LogarithmicQuantizer):
         members.append((".growing", quantizer.growing, "geometric intervals"))
-        edges = ", \\\n        ".join(_exact(edge) for edge in quantizer.edges)
+        edges = ", \\\n        ".join(exact(edge) for edge in quantizer.edges)
         members.append((".edges", f"(const double[]){{ \\\n        {edges}}}", unit))
     yield f"#define AERO_{name} {{ \\"
     for member, value, comment in members:

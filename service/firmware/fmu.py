@@ -1,14 +1,12 @@
 """FMU: the controller or the emulated plant as a co-simulation FMU of FMI 2.0, for Simulink, OpenModelica, FMPy….
 
 It steps by the loop's period alone. The law's FMU takes what the sensors measure and gives the voltages that the wire
-carries, quantized both ways; the plant's takes these and gives what its sensors measure. Wind and the gyro's noise are
-the importing tool's: the plant has inputs for loads.
+carries, quantized both ways; the plant's takes these, and loads such as wind, and gives what its sensors measure.
 """
 
 from __future__ import annotations
 
 import shutil
-import subprocess
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -17,14 +15,15 @@ from typing import Final, Literal, NamedTuple
 from xml.sax.saxutils import quoteattr
 from zipfile import ZIP_DEFLATED, ZipFile
 
-from aeroloop.plant_emulator.model.emulated import Sensors, initially, sensor_function, step_function
 from aeroloop.service.config import Settings
-from aeroloop.service.firmware.export import SOURCES, ExportError, braced, c_source, export, header
+from aeroloop.service.firmware.export import SOURCES, export, header
+from aeroloop.service.firmware.machines import compiled
+from aeroloop.service.firmware.plant import write_plant
 
 Which = Literal["aero", "law"]
 
 _ATTITUDE: Final = {**{f"q.{part}": "1" for part in "wxyz"}, **{f"omega.{axis}": "rad/s" for axis in "xyz"}}
-_COMPILE: Final = ("cc", "-std=c99", "-O2", "-ffp-contract=off", "-w", "-fPIC", "-shared", "-fvisibility=hidden")
+_SHARED: Final = ("-w", "-fPIC", "-shared", "-fvisibility=hidden")
 
 
 class _Model(NamedTuple):
@@ -34,7 +33,6 @@ class _Model(NamedTuple):
     inputs: Mapping[str, str]  # their units, by name
     outputs: Mapping[str, str]
     starts: Mapping[str, float]  # of inputs, where they are not 0
-    defined: Mapping[str, object]  # macros of the sources
 
 
 def write_fmu(settings: Settings, which: Which, path: Path) -> None:
@@ -51,17 +49,10 @@ def write_fmu(settings: Settings, which: Which, path: Path) -> None:
             "MODEL_INPUTS": len(model.inputs),
             "MODEL_STEP_S": settings.loop.period.hex(),
             "MODEL_GUID": f'"{guid}"',
-            **model.defined,
         }
         lines = [f"#define {key} {value}" for key, value in defined.items()]
         (folder / "model_config.h").write_text(header("model_config", lines), encoding="ascii")
-        library = folder / f"{which}.so"
-        command = [*_COMPILE, *map(str, [*model.sources, folder / "fmi2.c", "-o", library]), "-lm"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  # ours
-        except (OSError, subprocess.CalledProcessError) as error:
-            why = getattr(error, "stderr", "") or str(error)
-            raise ExportError(f"an FMU needs a C compiler, cc: {why.strip().splitlines()[0]}") from None
+        library = compiled([*model.sources, folder / "fmi2.c"], folder / f"{which}.so", *_SHARED)
         with ZipFile(path, "w", ZIP_DEFLATED) as archive:
             archive.writestr("modelDescription.xml", _description(settings, which, guid, model))
             archive.write(library, f"binaries/linux64/{library.name}")
@@ -70,35 +61,14 @@ def write_fmu(settings: Settings, which: Which, path: Path) -> None:
 def _law(settings: Settings, folder: Path) -> _Model:
     voltages = {f"u{motor}": "V" for motor in settings.wire.motors}
     sources = folder / "law.c", *(folder / f"aero_{part}.c" for part in ("wire", "law", "equations"))
-    return _Model(sources, _ATTITUDE, voltages, {"q.w": 1.0}, {})
+    return _Model(sources, _ATTITUDE, voltages, {"q.w": 1.0})
 
 
 def _plant(settings: Settings, folder: Path) -> _Model:
-    """Also writes the plant's equations."""
-    plant, period = settings.plant, settings.loop.period
-    mechanism = plant.mechanism()
-    step = step_function(mechanism, plant.rotor, plant.friction, period)
-    sensors, sensing = Sensors(plant.sensors, period), sensor_function(plant.sensors, period)
-    source = folder / "plant_equations.c"
-    source.write_text(c_source(step, sensing), encoding="ascii")
-    attitude, rate, angles = initially(mechanism)
-    states = step.numel_in("x")
-    defined = {
-        "ACTUATORS": mechanism.actuators,
-        "AXES": mechanism.axes,
-        "STATES": states,
-        "INITIAL": braced([*mechanism.initial, *[0.0] * (states - len(mechanism.initial))]),
-        "INITIAL_SEEN": braced([*attitude, *rate, *angles, 0.0, 0.0]),
-        "ZEROS": braced(sensors.zeros),
-        "VOLTAGE_LIMIT": plant.voltage_limit.hex(),
-        "SCRATCH": max(1, step.sz_w(), sensing.sz_w()),
-        "SCRATCH_ARGUMENTS": max(step.sz_arg(), sensing.sz_arg()),
-        "SCRATCH_RESULTS": max(step.sz_res(), sensing.sz_res()),
-    }
+    mechanism = settings.plant.mechanism()
     axes = ("pitch", "yaw") if mechanism.axes == 2 else ("x", "y", "z")
     inputs = {**{f"u{motor}": "V" for motor in settings.wire.motors}, **{f"load.{axis}": "N.m" for axis in axes}}
-    macros = {f"PLANT_{name}": value for name, value in defined.items()}
-    return _Model([folder / "plant.c", source], inputs, _ATTITUDE, {}, macros)
+    return _Model([folder / "aero.c", *write_plant(settings, folder)], inputs, _ATTITUDE, {})
 
 
 def _description(settings: Settings, which: Which, guid: str, model: _Model) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,6 +45,18 @@ MACHINES: Final[dict[str, Machine]] = {
 }
 """Processors by name. A Cortex-M4F has double precision in software only."""
 _BARE: Final = ("--specs=rdimon.specs", "-Tcortex_m.ld", "cortex_m.c")  # to link a program for no system
+
+
+def compiled(sources: Sequence[Path], out: Path, *flags: str) -> Path:
+    """Compile sources, with the headers beside them, for this machine. Raises ExportError."""
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise ExportError("this needs a C compiler: cc, gcc or clang")
+    words = [compiler, "-std=c99", "-O1", "-ffp-contract=off", *flags, *map(str, sources), "-o", str(out), "-lm"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # ours
+    if done.returncode:
+        raise ExportError(f"{out.name} does not compile: {(done.stderr.splitlines() or ['no message'])[0]}")
+    return out
 
 
 class Program:

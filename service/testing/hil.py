@@ -29,7 +29,7 @@ from aeroloop.service.testing.process_group import PATIENCE_S, ProcessGroup, Rol
 from aeroloop.service.testing.process_group import HilError as HilError
 from aeroloop.service.testing.process_group import __tracebackhide__ as __tracebackhide__
 
-PLANTS: Final = ("emulator", "can", "can-node", "quanser")
+PLANTS: Final = ("emulator", "can", "can-node", "can-node-c", "quanser")
 """Plant ends by name; any other name is of a plant, which the emulator runs."""
 
 PATIENCE_PER_STEP_S: Final = 0.02
@@ -42,8 +42,8 @@ class Hil:
     Args:
         folder: Folder of the logs.
         lockstep: Whether `run` counts steps instead of seconds.
-        plant: The plant end: a value of `plant.via`; can-node for an emulated node on a private bus; any other value of
-            `plant.kind`, such as package.module:Class, for the emulator with that plant.
+        plant: The plant end: a value of `plant.via`; can-node for an emulated node on a private bus, can-node-c for the
+            same in C; any other value of `plant.kind`, such as package.module:Class, for the emulator with that plant.
         config: TOML file to start from, unless `start` names another.
     """
 
@@ -51,10 +51,12 @@ class Hil:
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
     ) -> None:
         self._folder, self._lockstep, self._config = folder, lockstep, config
-        self._plant = {"plant.via": plant.replace("can-node", "can")}
+        self._private_bus = plant in ("can-node", "can-node-c")
+        self._plant: dict[str, Any] = {"plant.via": "can" if self._private_bus else plant}
         if plant not in PLANTS:
             self._plant = {"plant.via": "emulator", "plant.kind": plant}
-        self._private_bus = plant == "can-node"
+        if plant == "can-node-c":
+            self._plant["can.node_in_c"] = True
         self._processes: ProcessGroup | None = None
         self._logs: list[HilLog] = []
         self._requested_ticks = 0

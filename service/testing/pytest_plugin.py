@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--hil-plant",
         metavar="PLANT",
         help="plant end of `hil`: emulator (default); can, a node on the configured CAN bus; can-node, an emulated "
-        "node on a private bus; quanser, the board; or package.module:Class, a plant of your own",
+        "node on a private bus; can-node-c, the same in C; quanser, the board; or package.module:Class, your own plant",
     )
     group.addoption(
         "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, as fast as the machine allows"

@@ -16,12 +16,16 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import Heartbeat
 from aeroloop.service.testing.hil import Hil
 from aeroloop.service.testing.process_group import RoleName
+from tests.support.firmware import COMPILERS, NO_COMPILER
 
 WATCHDOG_S: Final = 0.1
 SLACK_S: Final = 0.3  # for a loop that other work on the machine keeps waiting, in five processes on two cores
 COMMAND, HEARTBEAT = 0x201, 0x301
 
 
+@pytest.mark.parametrize(
+    "node", ["can-node", pytest.param("can-node-c", marks=pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER))]
+)
 @pytest.mark.parametrize(
     ("killed", "states"),
     [
@@ -30,7 +34,7 @@ COMMAND, HEARTBEAT = 0x201, 0x301
     ],
 )
 def test_whichever_process_dies_the_node_is_at_rest_in_time(
-    tmp_path: Path, killed: RoleName, states: set[PlantState]
+    tmp_path: Path, killed: RoleName, states: set[PlantState], node: str
 ) -> None:
     """The bridge ("plant") releases it, or its own watchdog trips it: whichever is first, it is at 0 V then."""
     messages: list[can.Message] = []
@@ -40,7 +44,7 @@ def test_whichever_process_dies_the_node_is_at_rest_in_time(
         beats = [(each, Heartbeat.unpack(bytes(each.data), 0)) for each in messages if each.arbitration_id == HEARTBEAT]
         return next(((each.timestamp, beat.cause) for each, beat in beats if beat and beat.state in states), None)
 
-    with Hil(tmp_path, plant="can-node") as hil:
+    with Hil(tmp_path, plant=node) as hil:
         hil.start()
         bus = hil.settings.can
         with (

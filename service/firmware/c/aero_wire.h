@@ -26,7 +26,7 @@ extern const aero_quantizer aero_attitude, aero_rate, aero_voltage; /* as config
 /* Code of a value, a level's index or a continuous signal's value; beyond the range the outermost one, of NaN "no valid
  * value". `held` is the last code of a valid value, NaN before the first; AERO_HYSTERESIS alone depends on it. */
 double aero_encode(const aero_quantizer *q, double y, double held);
-double aero_level(const aero_quantizer *q, double code); /* in the signal's unit; NaN for "no valid value" and no code */
+double aero_level(const aero_quantizer *q, double code); /* signal's unit; NaN for "no valid value" and no code */
 double aero_no_value(const aero_quantizer *q);           /* code for "no valid value" */
 int aero_saturates(const aero_quantizer *q, double y);   /* whether a value is beyond the range */
 

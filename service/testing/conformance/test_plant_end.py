@@ -104,7 +104,7 @@ def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
 
 
 def test_without_a_valid_measurement_it_trips_and_says_so(hil: Hil, hil_plant: str) -> None:
-    if hil_plant in ("can", "quanser"):
+    if hil_plant in ("can", "can-node-c", "quanser"):
         pytest.skip("only an emulated plant's sensors fail on request")
     hil.start(settings={**PATIENT, "plant.faults": ["rate:off@0.3"]}, drive=False)
     hil.processes.start("controller")

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 import struct
-import subprocess
 from dataclasses import dataclass
-from importlib.resources import files
 from itertools import pairwise
 from math import inf, nan, nextafter
 from pathlib import Path
@@ -21,11 +18,8 @@ from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQua
 from aeroloop.protocol.wire.spec import LoopSettings, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Sender, Transmit
 from aeroloop.service.config import Settings
-from aeroloop.service.firmware.configuration import config_header
+from tests.support.firmware import COMPILERS, NO_COMPILER, SOURCE, library
 
-COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
-STRICT = ["-std=c99", "-Os", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC"]
-SOURCE = Path(str(files("aeroloop.service.firmware"))) / "c"
 SIGNALS = ("attitude", "rate", "voltage")
 SPECS: dict[str, Any] = {
     "the paper's": ("uniform 8", "uniform 8", "uniform 6", 2, 8, 15),
@@ -41,7 +35,7 @@ SPECS: dict[str, Any] = {
 }
 """ε, ω, u as kind, bits and lengths in parts of the limit; actuators; counter bits; heartbeat in ticks of 50 ms."""
 
-pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler: neither gcc nor clang")
+pytestmark = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 
 
 @dataclass
@@ -75,11 +69,7 @@ def wire(request: pytest.FixtureRequest, tmp_path: Path) -> Wire:
         **fields, actuators=actuators, counter_bits=counter_bits, transmit=Transmit(heartbeat_s=heartbeat / 20)
     )
     settings = Settings(wire=spec, loop=LoopSettings(rate_hz=20))
-    (tmp_path / "aero_config.h").write_text(config_header(settings))
-    library = tmp_path / "wire.so"
-    words = [f"-I{tmp_path}", f"-I{SOURCE}", "-o", str(library), str(SOURCE / "aero_wire.c"), "-lm"]
-    subprocess.run([compiler, *STRICT, *words], check=True)
-    c = ctypes.CDLL(str(library))
+    c = library(settings, tmp_path, SOURCE / "aero_wire.c", compiler=compiler)
     c.aero_encode.restype = c.aero_level.restype = c.aero_no_value.restype = ctypes.c_double
     c.aero_encode.argtypes = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double]
     c.aero_level.argtypes = c.aero_saturates.argtypes = [ctypes.c_void_p, ctypes.c_double]
