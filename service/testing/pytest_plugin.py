@@ -5,6 +5,7 @@ It imports the loop's modules only when a test uses the fixture.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -14,8 +15,8 @@ import pytest
 if TYPE_CHECKING:
     from aeroloop.service.testing.hil import Hil
 
-SOFTWARE = ("emulator", "can-node")
-"""Plant ends without hardware: the defaults of the conformance suite."""
+SOFTWARE = ("emulator", "can-node", *(("can-node-c",) if shutil.which("cc") else ()))
+"""Plant ends without hardware: the defaults of the conformance suite. The node in C needs a compiler."""
 _LOOP: Final = pytest.StashKey["Hil"]()
 
 

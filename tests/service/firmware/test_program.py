@@ -17,7 +17,8 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID, CanSettings, Heartbeat
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.config import Settings
-from aeroloop.service.firmware.node import FirmwareError, build, run
+from aeroloop.service.firmware.export import ExportError
+from aeroloop.service.firmware.node import build, run
 from aeroloop.service.lab.demo import run_demo
 from aeroloop.service.testing.process_group import private_bus
 from tests.support.firmware import COMPILERS, NO_COMPILER
@@ -104,6 +105,6 @@ def test_bad_datagrams_do_not_disturb_it_and_it_ends_when_its_parent_has(setting
     ],
 )
 def test_what_it_cannot_do_is_refused_in_one_line(settings: Settings, changed: dict[str, Any], reason: str) -> None:
-    with pytest.raises(FirmwareError, match=reason) as refusal:
+    with pytest.raises(ExportError, match=reason) as refusal:
         run(settings.model_copy(update=changed), Event())
     assert "\n" not in str(refusal.value)
