@@ -15,6 +15,7 @@ from aeroloop.service.firmware.fmu import write_fmu
 from aeroloop.service.firmware.machines import MACHINES, InC, Program
 from aeroloop.service.lab.experiment import experiment
 from aeroloop.service.logs.replay import replay
+from tests.support.firmware import COMPILERS, NO_COMPILER
 from tests.support.own_laws import PYTHON
 
 GOLDEN = Path(__file__).parents[2] / "golden"
@@ -40,10 +41,11 @@ def needs(machine: str) -> Any:
     return pytest.param(machine, marks=pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)} here"))
 
 
+@pytest.mark.parametrize("machine", [needs("host")])
 @pytest.mark.parametrize("words", CONFIGURATIONS.values(), ids=CONFIGURATIONS)
-def test_the_golden_commands_are_computed_in_c(words: list[str], tmp_path: Path) -> None:
+def test_the_golden_commands_are_computed_in_c(words: list[str], machine: str, tmp_path: Path) -> None:
     export(load(overrides=words), tmp_path)
-    assert Program(tmp_path, "host").golden() == SAME
+    assert Program(tmp_path, machine).golden() == SAME
 
 
 @pytest.mark.parametrize("machine", [needs("host"), needs("aarch64"), needs("cortex-m4")])
@@ -79,6 +81,7 @@ def test_a_law_in_python_and_a_missing_compiler_are_one_clear_line(
         Program(tmp_path / "c", "cortex-m4")
 
 
+@pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 def test_fmus_of_law_and_plant_give_the_voltages_of_the_experiment(tmp_path: Path) -> None:
     """FMPy checks both files, and connects them; nothing is shared with the experiment but the sources."""
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: it comes with aeroloop[fmi]")
