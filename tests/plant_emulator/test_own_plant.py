@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
 from tests.support.own_plants import Turntable, TurntableSettings
-from tests.support.plant_stage import Stage
+from tests.support.plant_end import Stage
 
 HERE = "tests.support.own_plants"
 TABLE = f"{HERE}:Turntable"
@@ -193,9 +193,7 @@ def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch:
     assert stage_of("Turntable", WireSpec(actuators=1), lockstep=False).run(TICKS).skipped == 2
 
 
-def test_garbage_of_a_plant_is_collected_with_a_session_and_without(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_garbage_of_a_plant_is_collected_with_a_session_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
     sessions = list[str | None]()
     stage = stage_of("Turntable", WireSpec(actuators=1), lockstep=False)
     driver = "aeroloop.plant_emulator.hosts.driver.collect_garbage"

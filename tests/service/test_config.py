@@ -13,10 +13,13 @@ from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Hold, Points, Sinusoid, Stream
 from aeroloop.protocol.wording import keys
+from aeroloop.service.cli.main import execute
 from aeroloop.service.config import ENV_PREFIX, ConfigError, PointsFile, Settings, from_description, load
-from aeroloop.service.config_sources import BODY
+from aeroloop.service.config_sources import BODY, OTHER_SECTIONS, Target, load_target
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import MODELS
+from aeroloop.service.host import operator
+from aeroloop.service.settings import read_points
 from tests.support.hostile import mutated
 
 KEYS = keys(Settings)
@@ -193,3 +196,127 @@ def test_another_law_keeps_the_body_and_nothing_else(tmp_path: Path) -> None:
     assert (law.kind, law.mass, law.inertia) == ("pd", 2.0, load().law.inertia)
     assert not hasattr(law, "C1")
     assert set(BODY) == set(LawSettings.model_fields) - {"kind"}
+
+
+# ── points from a CSV file: what is read, and in one line what is not ──
+
+
+BARE_ROWS = "0,0,0,0\n1.5,0,10,-20.5\n3e0,0,0,1\n"
+BARE_POINTS = Points(times=[0.0, 1.5, 3.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 10.0, -20.5), (0.0, 0.0, 1.0)])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(BARE_ROWS, id="bare"),
+        pytest.param(f'"time [s]","roll\n[deg]",pitch,yaw\n{BARE_ROWS}', id="quoted heading of two lines"),
+        pytest.param(BARE_ROWS.replace(",", ", ").replace("1.5", '"1.5"'), id="spaces and quotes"),
+        pytest.param("\ufeff" + BARE_ROWS, id="saved by a spreadsheet"),
+    ],
+)
+def test_a_table_of_points_is_read_with_or_without_a_heading(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "points.csv"
+    path.write_bytes(content.encode())
+    assert read_points(path) == BARE_POINTS
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        pytest.param("1,0,0,0\n2,0,0,0\n", "the first time must be 0", id="what Points refuses"),
+        pytest.param("0,0,0,0\n1,0,0\n", r"attitudes\[1\]", id="three"),
+        pytest.param("time,roll,pitch,yaw\n0,0,0,0\n\n1,0,,0\n", r"attitudes\[1\]\[1\]: .*number", id="an empty cell"),
+        pytest.param(b"0,0,0,0\n\xff\xfe,0,0,0\n", "it is not text", id="bytes"),
+        pytest.param(None, "directory", id="a folder"),
+    ],
+)
+def test_what_is_no_table_of_points_is_reported_in_one_line_with_the_file(
+    tmp_path: Path, content: str | bytes | None, why: str
+) -> None:
+    path = tmp_path if content is None else tmp_path / "points.csv"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ConfigError, match=why) as refused:
+        read_points(path)
+    assert str(path) in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+# ── counter bits: a frame counter too short to detect late frames is refused, with a remedy ──
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    bits=st.integers(4, 16),
+    rate=st.sampled_from([1, 20, 50, 100, 250, 500, 1000, 4000, 10_000]),
+    watchdog=st.sampled_from([0.01, 0.1, 0.128, 0.256, 1, 2, 10]),
+    stale=st.sampled_from([0.01, 0.1, 0.128, 0.256, 1, 2, 10]),
+)
+def test_a_counter_counts_twice_the_watchdog_and_the_stale_time_or_the_refusal_states_how_many_bits_would(
+    bits: int, rate: int, watchdog: float, stale: float
+) -> None:
+    loop = (f"loop.rate_hz={rate}", f"plant.watchdog_s={watchdog}", f"controller.stale_s={stale}")
+    needed = 2 * max(watchdog, stale) * rate
+    if 2**bits >= needed:
+        assert load(overrides=[*loop, f"wire.counter_bits={bits}"]).wire.counter_bits == bits
+        return
+    name = "plant.watchdog_s" if watchdog >= stale else "controller.stale_s"
+    with pytest.raises(ConfigError, match=rf"^wire\.counter_bits = {bits} counts .*{name}") as refused:
+        load(overrides=[*loop, f"wire.counter_bits={bits}"])
+    if found := re.search(r"set it to (\d+)$", str(refused.value)):
+        least = int(found[1])
+        assert 2 ** (least - 1) < needed <= 2**least
+        assert load(overrides=[*loop, f"wire.counter_bits={least}"]).wire.counter_bits == least
+    else:
+        assert needed > 2**16
+        assert f"16 bits are too few; shorten {name}, or lower loop.rate_hz" in str(refused.value)
+
+
+def test_a_short_counter_is_accepted_in_lockstep_and_on_a_can_bus_whose_frame_holds_no_longer_one() -> None:
+    assert load(overrides=["wire.counter_bits=4", "loop.lockstep=true"]).wire.counter_bits == 4
+    ten_bits = ("wire.attitude.bits=10", "wire.rate.bits=10", "wire.counter_bits=4")
+    assert load(overrides=["plant.via=can", *ten_bits]).wire.counter_bits == 4
+    for others in (ten_bits, ["plant.via=can", "can.fd=true", *ten_bits], ["plant.via=can", "wire.counter_bits=4"]):
+        with pytest.raises(ConfigError, match=r"set it to 7$"):
+            load(overrides=others)
+
+
+# ── the address of a vehicle: an operator's command starts light, and stops a plant whatever else is misconfigured ──
+
+
+def test_every_other_section_is_left_unread() -> None:
+    assert {*Target.model_fields, *OTHER_SECTIONS} == set(Settings.model_fields)
+    assert load_target(None, [f"{name}.x=1" for name in OTHER_SECTIONS]) == Target()
+
+
+def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "config.toml"
+    file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n[plnt]\nx = 1\n')
+    monkeypatch.setenv("AEROLOOP_LAW__NONE", "1")
+    monkeypatch.setenv("AEROLOOP_LOP__RATE_HZ", "1")
+    monkeypatch.setenv("AEROLOOP_NETWORK__MODE", "client")
+    found = load_target(file, ["network.insecure=true", "plant.vai=can", "lop=1"])
+    assert (found.vehicle, found.network.mode, found.network.insecure) == ("beta", "client", True)
+
+
+@pytest.mark.parametrize(
+    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "x.y=1"]
+)
+def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
+    with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):
+        load_target(None, [given])
+
+
+def test_every_plant_is_stopped_unless_a_vehicle_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[str | None] = []
+
+    def stop(_: object, vehicle: str | None) -> operator.Stopped:
+        stopped.append(vehicle)
+        return operator.Stopped(["at 0 V"], [])
+
+    monkeypatch.setattr(operator, "stop", stop)
+    for words in ((), ("--set", "vehicle=aero"), ("--set", "vehicle=aero", "--all")):
+        assert execute(["op", "stop", *words]) == 0
+    assert stopped == [None, "aero", None]

@@ -1,4 +1,4 @@
-"""Examples: each runs unchanged in a process, as its opening docstring shows.
+"""Examples: each runs unchanged, as its opening docstring shows.
 
 Real-time tests wait up to half a minute for an event; on an idle machine each comes within 3 s.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import runpy
 import subprocess
 import sys
 from functools import partial
@@ -24,47 +25,47 @@ from tests.support.made_log import make_log
 from tests.support.processes import LONGEST_S
 from tests.support.processes import aeroloop as aeroloop_command
 
-pytestmark = pytest.mark.processes
-
 EXAMPLES = Path(examples.__path__[0])
 
 
-def run(folder: Path, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, *words], cwd=folder, capture_output=True, text=True, check=False, timeout=LONGEST_S
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def printed_by(name: str, *words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """What an example prints as a program, in this process."""
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    return capsys.readouterr().out
 
 
-def test_a_log_is_read_back_into_numpy(tmp_path: Path) -> None:
-    make_log(tmp_path / "run.mcap", 500)
-    printed = run(tmp_path, str(EXAMPLES / "read_log.py"), "run.mcap")
+def test_a_log_is_read_back_into_numpy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_log(log := tmp_path / "run.mcap", 500)
+    printed = printed_by("read_log.py", str(log), capsys=capsys, monkeypatch=monkeypatch)
     assert printed.startswith("500 ticks of 2 ms, 0.998 s\n")
-    read = aeroloop.read_run(tmp_path / "run.mcap")
+    read = aeroloop.read_run(log)
     assert read.ticks.attitude.shape == (500, 4)
     assert read.time[-1] == pytest.approx(0.998)
     assert f"z_track = {read.figures.z_track}, " in printed
 
 
-def test_faults_are_searched_at_the_hardest_instants_of_a_log(tmp_path: Path) -> None:
-    make_log(tmp_path / "run.mcap", 600)
-    printed = run(tmp_path, str(EXAMPLES / "fork_faults.py"), "run.mcap").splitlines()
+def test_faults_are_searched_at_the_hardest_instants_of_a_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_log(log := tmp_path / "run.mcap", 600)
+    printed = printed_by("fork_faults.py", str(log), capsys=capsys, monkeypatch=monkeypatch).splitlines()
     assert len(printed) == 4  # of one second, four faults
     assert all(re.fullmatch(r"tick \d+, [\w.:=@]+: [1-9]\d?\.\d\d° .*", line) for line in printed), printed
 
 
-def test_logs_are_checked_where_the_test_is_copied_to(tmp_path: Path) -> None:
-    (tmp_path / "test_logs.py").write_text((EXAMPLES / "test_logs.py").read_text())
+@pytest.mark.processes
+@pytest.mark.realtime  # pytest in pytest, which starts processes
+@pytest.mark.parametrize(("name", "options"), [("test_logs.py", ()), ("test_lockstep_hil.py", ("--hil-lockstep",))])
+def test_the_tests_pass_where_they_are_copied_to(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
+    (tmp_path / name).write_text((EXAMPLES / name).read_text())
     (tmp_path / "logs").mkdir()
     make_log(tmp_path / "logs" / "a.mcap", 200)
-    assert "1 passed" in run(tmp_path, "-m", "pytest", "-q", "test_logs.py")
-
-
-def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
-    name = "test_lockstep_hil.py"
-    (tmp_path / name).write_text((EXAMPLES / name).read_text())
-    assert "1 passed" in run(tmp_path, "-m", "pytest", "-q", "--hil-lockstep", name)
+    command = [sys.executable, "-m", "pytest", "-q", *options, name]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=LONGEST_S)
+    assert "1 passed" in done.stdout, done.stdout + done.stderr
 
 
 PUBLIC = """
@@ -84,19 +85,7 @@ def test_the_public_names_are_those_and_each_is_documented() -> None:
         aeroloop.nonsense  # noqa: B018  # the access is what is tested
 
 
-def test_an_experiment_takes_a_plant_and_a_controller_of_ones_own() -> None:
-    settings = aeroloop.load_settings(overrides={"wire.voltage.bits": 8})
-    controller = aeroloop.Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
-    plant = settings.plant.build(settings.loop.period)
-    seen: list[int] = []
-    figures = aeroloop.run_experiment(
-        settings, 0.5, plant=plant, controller=controller, watch=lambda k, *_: seen.append(k)
-    )
-    assert figures == aeroloop.run_experiment(settings, 0.5)
-    assert seen == list(range(250))
-    assert controller.tick_index == 249
-
-
+@pytest.mark.processes
 @pytest.mark.realtime
 def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(tmp_path: Path) -> None:
     """In a folder of the user's own, into which the examples are printed as the README says."""
@@ -123,6 +112,7 @@ def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(tmp_pat
     assert "did you mean law.stiffness?" in wrong
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("failure", "fault"),
     [

@@ -52,7 +52,7 @@ def test_what_can_be_ridden_out_is(fault: str, bound: float) -> None:
 
 
 def test_a_fault_that_is_over_leaves_the_loop_as_good_as_before() -> None:
-    assert (run("rate:bias=0.5@3..5").final_error_deg or 99) < 1.5  # 0.9 without a fault, 14 with it
+    assert (run("rate:bias=0.5@3..5", 10.0).final_error_deg or 99) < 1.0  # 0.5 without, 12 with it
 
 
 def test_faults_on_frames_are_refused_where_no_network_is() -> None:

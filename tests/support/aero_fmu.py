@@ -73,7 +73,7 @@ def _equations() -> ca.Function:
 def fmi2(folder: Path) -> Path:
     """The Aero's period as C code: inputs u2, u3 [V]; outputs q[1]…q[4], rate.x…, pitch, yaw; it fails on request."""
     folder.mkdir()
-    step = step_function(ideal.PLANT.mechanism(), ideal.ROTOR, ideal.FRICTION, PERIOD)
+    step = step_function(ideal.PLANT.mechanism(), ideal.PLANT.rotor, ideal.PLANT.friction, PERIOD)
     with chdir(folder):
         step.generate("step.c")
     inputs, loads, settings = ("u2", "u3"), ("load_pitch", "load_yaw"), ("fails_at", "fails_with")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from aeroloop.service.lab import engine
+from aeroloop.service.lab import check, engine
 from aeroloop.service.lab.engine import Workers
 
 
@@ -34,4 +34,5 @@ def _here() -> Iterator[Workers]:
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "local_processes", _here)
+    for module in (engine, check):
+        monkeypatch.setattr(module, "local_processes", _here)

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from aeroloop.plant_emulator.model.bodies import RigidBodySettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import configured_gains, initial_state, law_function, law_of
 from tests.support import numpy_twin as twin
@@ -36,13 +38,13 @@ def unit(rng: np.random.Generator, size: int = 4) -> Array:
     return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
 
 
-def weight_torque(p: LawSettings, q: Array) -> Array:
+def weight_torque(p: LawSettings | RigidBodySettings, q: Array) -> Array:
     """Torque of the weight about the origin, body frame [N·m]."""
     return np.cross(p.centre_of_mass, twin.rotation(q).T @ np.array([0, 0, -p.mass * p.gravity]))
 
 
-def acceleration(p: LawSettings, q: Array, omega: Array, torque: Array) -> Array:
-    """ω̇ of the law's body by (C.2); `torque` is all but the weight's and the gyroscopic one."""
+def acceleration(p: LawSettings | RigidBodySettings, q: Array, omega: Array, torque: Array) -> Array:
+    """ω̇ of a body by (C.2); `torque` is all but the weight's and the gyroscopic one."""
     J = np.array(p.inertia)
     return np.asarray((torque + weight_torque(p, q) - np.cross(omega, J * omega)) / J)
 
@@ -58,3 +60,12 @@ def errors_at(
     here = q + t / 2 * product(q, np.append(0, omega))
     there = q_d + t / 2 * product(np.append(0, omega_d), q_d)
     return errors(here, omega + t * omega_dot, there, omega_d + t * omega_d_dot)
+
+
+def body_of(p: AdaptiveSettings) -> twin.Body:
+    """The twin's body and gains, of the project's settings."""
+    J, B, centre = np.diag(p.inertia), np.array(p.allocation), np.array(p.damping_estimate)
+    gains = {name: np.diag(getattr(p, name)) for name in ("C1", "C2", "Gamma")}
+    return twin.Body(
+        J=J, m=p.mass, g=p.gravity, r_g=np.array(p.centre_of_mass), B=B, bound=p.damping_bound, centre=centre, **gains
+    )

@@ -27,6 +27,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.recording.rolling import LogFile
+from tests.support.clock import FakeClock
 from tests.support.plant_end import claim_of
 
 START_NS: Final = 1_800_000_000_000_000_000  # when tick 0 is measured, on the plant's wall clock
@@ -44,11 +45,11 @@ def lockstep(*overrides: str) -> Settings:
     return load(overrides=["loop.lockstep=true", *overrides])
 
 
-class Clock:
-    """One end's clocks, as `time` for its modules."""
+class Clock(FakeClock):
+    """One end's clocks: `now_ns` since tick 0, for everybody, as its monotonic and its wall clock show it."""
 
     def __init__(self, end: End, drift: float = 0.0) -> None:
-        self.now_ns = 0  # since tick 0, for everybody
+        super().__init__(now_ns=0)
         self._monotonic_ns = MONOTONIC_NS[end]
         self._wall_ns = START_NS + (AHEAD_NS if end == "controller" else 0)
         self._rate = 1.0 + drift
@@ -59,14 +60,8 @@ class Clock:
     def monotonic_ns(self) -> int:
         return self.at(self.now_ns)
 
-    def monotonic(self) -> float:
-        return self.monotonic_ns() * 1e-9
-
     def time_ns(self) -> int:
         return self._wall_ns + self.now_ns
-
-    def sleep(self, seconds: float) -> None:
-        self.now_ns += round(seconds * 1e9)
 
 
 class Logged(NamedTuple):

@@ -96,10 +96,6 @@ class Hosts:
         sets = [word for override in [*network, *overrides] for word in ("--set", override)]
         return [*(["--config", str(self._config)] if self._config else []), *sets]
 
-    def output(self, host: str, *words: str) -> str:
-        command = ["ip", "netns", "exec", self._prefix + host, sys.executable, "-m", "aeroloop", *words]
-        return subprocess.run([*command, *self.options()], check=True, capture_output=True, text=True).stdout
-
     def python(
         self,
         host: str,

@@ -35,7 +35,7 @@ PERIOD = 0.002
 LAW = AdaptiveSettings()
 LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
 SWING = Sinusoid(amplitude=(0.0, 5.0, 20.0), frequency=(0.0, 0.5, 0.4))
-CONFIGURED = ControllerSettings(after_restart="configured")  # which session begins with what: test_session_start.py
+CONFIGURED = ControllerSettings(after_restart="configured")  # which session begins with what: test_operator_changes.py
 WIRE = WireSpec(
     attitude=SignalSpec(bits=None, limit=1.0),
     rate=SignalSpec(bits=None, limit=5.0),

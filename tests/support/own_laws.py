@@ -63,25 +63,6 @@ class Python(PythonLaw[PDSettings]):
         return np.asarray(-(kp * error) - kd[first:] * rate - ki * self.state["sum"])
 
 
-class Node:
-    """Half of a reference cycle, which only the garbage collector can free; `alive` counts those not yet freed."""
-
-    alive = 0
-
-    def __init__(self) -> None:
-        Node.alive += 1
-        self.other: Node
-
-    def __del__(self) -> None:
-        Node.alive -= 1
-
-
-def cycle() -> Node:
-    node, node.other = (pair := Node()), Node()
-    node.other.other = pair
-    return node
-
-
 class Bare(ExpressionLaw[LawSettings]):
     Settings = LawSettings
 

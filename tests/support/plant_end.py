@@ -1,19 +1,29 @@
-"""Plant ends under test: a claim for one, a plant that records its voltages, and queries to one on Zenoh."""
+"""Plant ends under test: a claim, a plant that records its voltages, queries on Zenoh, a driver's loop in fake time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+from unittest.mock import patch
 
 import zenoh
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
+from aeroloop.plant_emulator.hosts.trace import PlantTrace
 from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Grant, Refusal
-from aeroloop.protocol.messages.operator import Answer, Message, Request
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal, SessionRecord
+from aeroloop.protocol.messages.operator import Answer, Gains, Hold, Message, Request
 from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.messages.trace import Batch, read_batch
+from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.attitude import IDENTITY, Vector
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from tests.support.clock import FakeClock
 from tests.support.zenoh_network import PATIENCE_S, eventually
 
 PERIOD_NS = 2_000_000
@@ -22,6 +32,8 @@ COUNTERS = WIRE.measurement.counters
 OFF = (0.0, 0.0)
 AT_REST: Vector = (0.0, 0.0, 0.0)
 REST = Measurement(IDENTITY, AT_REST)
+GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
+TURNED = Hold(attitude=(0.0, 0.0, 30.0))
 
 
 def claim_of(
@@ -42,6 +54,15 @@ def claim_of(
         auto_arm=auto_arm,
         wire=wire,
     )
+
+
+def record_of(name: str, **changed: Any) -> SessionRecord:
+    """A record of a controller's session, in which an operator gave gains and a reference; `changed` are fields."""
+    given: dict[str, Any] = {
+        "controller": name, "session": f"of-{name}", "gains": GAINS, "gains_from": "operator", "reference": TURNED,
+        "reference_from": "operator", "within_s": 2.0, "since_tick": 0,
+    }  # fmt: skip
+    return SessionRecord(**given | changed)
 
 
 def command(echo: int, code: int = 5) -> bytes:
@@ -129,3 +150,129 @@ class Asker:
         refused = self.claim(auto_arm=auto_arm)
         assert isinstance(refused, Refusal)
         return refused.reason
+
+
+# ── a driver's loop on a scripted link and network, in the time of a fake clock ──
+
+
+RUN = 0x0123_4567_89AB_CDEF
+
+
+class Wires(Link):
+    """Frames on their way to the plant, each due at a tick; the newest that is due is taken."""
+
+    def __init__(self, clock: FakeClock, answer: Callable[[bytes], None]) -> None:
+        self.tick = -1
+        self._clock = clock
+        self.sent: list[bytes] = []
+        self.answer = answer
+        self._due: list[tuple[int, bytes]] = []
+
+    def deliver(self, frame: bytes, tick: int) -> None:
+        self._due.append((tick, frame))
+
+    def send(self, frame: bytes) -> None:
+        self.sent.append(frame)
+        self.answer(frame)
+
+    @property
+    def pending(self) -> bool:
+        return any(tick <= self.tick for tick, _ in self._due)
+
+    def take(self) -> Arrival | None:
+        due = [frame for tick, frame in self._due if tick <= self.tick]
+        self._due = [(tick, frame) for tick, frame in self._due if tick > self.tick]
+        return Arrival(due[-1], self._clock.monotonic_ns()) if due else None
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        del timeout_s
+        return self.take()
+
+    def close(self) -> None:
+        self._due.clear()
+
+
+class Stage(PlantNetwork):
+    """Runs the driver of the plant `made`, an emulator's unless given, to a tick.
+
+    `between` is called between ticks, `answer` with every measurement that is sent (UNCHANGED in lockstep only), and
+    `skip` gives the ticks to skip before the next. `sent` are the measurements, `wires` the way of the commands.
+    """
+
+    def __init__(
+        self,
+        loop: LoopSettings,
+        wire: WireSpec,
+        plant: PlantSettings,
+        *,
+        between: Callable[[Stage], None] = lambda _: None,
+        answer: Callable[[Stage, bytes], None] = lambda *_: None,
+        skip: Callable[[], int] = lambda: 0,
+        made: Plant | None = None,
+    ) -> None:
+        super().__init__()
+        self.stop, self.clock = threading.Event(), FakeClock()
+        self.loop, self.wire = loop, wire
+        self.endpoint = plant.endpoint(made or plant.make(loop.period), loop, wire)
+        self.wires = Wires(self.clock, lambda frame: answer(self, frame))
+        self._published: deque[bytes] = deque()
+        self.trace = PlantTrace(wire, self._published.append, RUN, self.clock)
+        self._between, self._skip = between, skip
+        self._claims = 0
+        self._ends = 0
+
+    def run(self, ticks: int) -> Self:
+        self._ends = ticks
+        with patch("aeroloop.plant_emulator.hosts.driver.ANSWER_TIMEOUT_S", -1.0):  # nothing comes by waiting
+            Driver(self.endpoint, self, self.loop, self.stop, self.clock).run()
+        return self
+
+    @property
+    def batches(self) -> list[Batch]:
+        batches = [read_batch(payload) for payload in self._published]
+        assert None not in batches
+        return [batch for batch in batches if batch is not None]
+
+    def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
+        self._claims += 1
+        of_loop: dict[str, Any] = {"period_ns": self.loop.period_ns, "lockstep": self.loop.lockstep}
+        return self.endpoint.claim(
+            claim_of("c", wire=self.wire, auto_arm=auto_arm, session=f"s{self._claims}", **of_loop)
+        )
+
+    def command(self, measurement: bytes, codes: Sequence[float]) -> None:
+        counter = self.wire.measurement.counter(measurement)
+        assert counter is not None
+        self.wires.deliver(self.wire.command.pack(counter, codes), self.endpoint.ticked)
+
+    @property
+    def link(self) -> Link | None:
+        return self.wires if self.endpoint.session is not None else None
+
+    def serve(self) -> None:
+        """Nothing to declare."""
+
+    def take_inbox(self) -> None:
+        self._between(self)
+        if skipped := self._skip():
+            self.clock.advance((skipped + 0.5) * self.loop.period)
+        self.follow_session()
+
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        self.trace.row(self.endpoint, measurement, arrival, sent_ns)
+        self.wires.tick = self.endpoint.ticked
+        self.follow_session()
+        if self.endpoint.ticked >= self._ends:
+            self.stop.set()
+
+    def follow_session(self) -> None:
+        self.trace.follow(self.endpoint)
+        if self.endpoint.session is None:
+            self.wires.close()
+
+    def publish_status(self) -> None:
+        """Nobody reads it."""
+
+    def leave(self) -> None:
+        self.follow_session()
+        self.trace.finish()

@@ -33,10 +33,6 @@ class SimulatedLink(FakeClock, Link):
             self._waiting.append(self._coming.popleft())
 
     @property
-    def over(self) -> bool:
-        return not self._coming and not self._waiting
-
-    @property
     def pending(self) -> bool:
         self.pass_time(self.now_ns)
         return bool(self._waiting)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from math import nan
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
@@ -291,11 +291,13 @@ class OfRelay(PlantEnd):
 
 
 TestEndpoint, TestRelay = OfEndpoint.TestCase, OfRelay.TestCase
-TestEndpoint.settings = TestRelay.settings = settings(max_examples=120, stateful_step_count=40)
+TestEndpoint.settings = TestRelay.settings = settings(max_examples=80, stateful_step_count=40)
 
 
 @pytest.mark.parametrize("end", ENDS)
-@settings(max_examples=50)
+@settings(max_examples=30)
+@example(delay=WATCHDOG)
+@example(delay=WATCHDOG + 1)
 @given(delay=st.integers(0, 5 * COUNTERS))
 def test_a_stream_that_is_late_for_good_drives_within_the_watchdogs_time_and_never_beyond(
     end: Callable[..., EndpointEnd | RelayEnd], delay: int

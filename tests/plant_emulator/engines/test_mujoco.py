@@ -82,7 +82,7 @@ def _experiment(coulomb: bool, bits: int | str) -> Settings:
         {
             "plant": {
                 "friction": FrictionSettings() if coulomb else FrictionSettings(coulomb=()),
-                "sensors": ideal.SENSORS,
+                "sensors": ideal.PLANT.sensors,
             },
             "wire": {signal: {"bits": bits, "limit": limit} for signal, limit in edge.items()},
             "controller": {"after_restart": "configured"},

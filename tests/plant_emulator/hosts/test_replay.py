@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from random import Random
 from typing import get_args
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, PlantChangeKind
 from aeroloop.protocol.wire.spec import LoopSettings, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Transmit
-from tests.support.plant_stage import Stage
+from tests.support.plant_end import Stage
 
 TICKS = 400
 FAULTS = (
@@ -147,8 +146,7 @@ def undisturbed() -> tuple[LoopSettings, WireSpec, list[Batch]]:
             stage.claim()
 
     stage = Stage(loop, wire, PLANT, between=claim, answer=lambda stage, frame: stage.command(frame, (1, -1)))
-    with patch("aeroloop.protocol.messages.trace.TRACE_NS", 10**12):  # batches of 256 rows, however fast it runs
-        return loop, wire, stage.run(600).batches
+    return loop, wire, stage.run(600).batches
 
 
 @settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.generate])
@@ -211,7 +209,7 @@ def test_it_stops_with_the_reason_where_it_cannot_follow() -> None:
     second, other = with_rows[1], batches[0]._replace(header=batches[0].header._replace(run=1))
     wider = WireSpec().with_bits("10/10")
     stops: tuple[tuple[WireSpec, list[Batch], int, str], ...] = (
-        (wire, batches[:second] + batches[second + 1 :], 256, "256 rows are missing after row 255 of the plant"),
+        (wire, batches[:second] + batches[second + 1 :], 51, "51 rows are missing after row 50 of the plant"),
         (wire, batches[second:], 0, "the log lacks the plant's first row, so the plant's state is not known"),
         (wire, batches[with_rows[0] :], 0, "tick 1 is in a session whose claim is missing"),
         (wire, [], 0, "the log has no trace of the plant"),

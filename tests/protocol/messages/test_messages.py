@@ -1,13 +1,15 @@
-"""Messages: round trips through JSON, bounds of every field, and bounded work for whatever comes."""
+"""Messages, their keys, and the states that they report: round trips, bounds of every field, bounded work."""
 
 from __future__ import annotations
 
 import json
+import string
 from math import inf, nan
 from random import Random
 from typing import Any
 
 import pytest
+import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -28,7 +30,16 @@ from aeroloop.protocol.messages.operator import (
     Sinusoid,
     Track,
 )
-from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS
+from aeroloop.protocol.messages.states import (
+    CONTROLLER_TABLE,
+    PLANT_TABLE,
+    ControllerState,
+    ControllerTrigger,
+    Machine,
+    PlantState,
+    PlantTrigger,
+)
+from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS, Address, Topic, key, read_key
 from tests.support.every_message import MESSAGES
 from tests.support.hostile import mutated
 
@@ -161,3 +172,96 @@ def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
     error, *_ = refused.value.errors()
     said = f"{error['loc'][0] if error['loc'] else model.__name__}: {error['msg'].removeprefix('Value error, ')}"
     assert said.startswith(expected)
+
+
+# ── topics: every key is parsed back to its topic and fields, and no other key is ──
+
+
+every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
+
+LETTERS = string.ascii_letters + string.digits
+vehicles = st.builds(str.__add__, st.sampled_from(LETTERS), st.text(LETTERS + "_.-", max_size=63))
+chunks = st.text("0123456789abcdef", min_size=8, max_size=32)
+"""Sessions and roles. A session called like a topic ("status") would be read as one; none is made."""
+
+
+@every_topic
+@settings(max_examples=25)
+@given(vehicle=vehicles, session=chunks, role=chunks)
+def test_a_key_is_read_back_as_what_it_was_made_from(topic: Topic, vehicle: str, session: str, role: str) -> None:
+    text = key(topic.name, vehicle, session=session, role=role)
+    of_session = session if "{session}" in topic.key else None
+    of_role = role if "{role}" in topic.key else None
+    assert text.startswith(f"aeroloop/{vehicle}/")
+    assert read_key(text) == Address(topic, vehicle, of_session, of_role)
+
+
+@every_topic
+def test_what_is_left_out_of_a_key_is_a_wildcard_and_others_have_other_keys(topic: Topic) -> None:
+    pattern, mine = zenoh.KeyExpr(key(topic.name, "aero")), key(topic.name, "aero", session="s1", role="plant")
+    assert pattern.includes(zenoh.KeyExpr(mine))
+    assert not pattern.intersects(zenoh.KeyExpr(key(topic.name, "other", session="s1", role="plant")))
+    assert (mine == key(topic.name, "aero", session="s2", role="recorder")) == ("{" not in topic.key)
+
+
+@every_topic
+def test_a_topic_s_kind_says_what_else_it_has(topic: Topic) -> None:
+    assert ("observer" in topic.receivers) == (topic.kind != "query")  # whatever is published may be observed
+    if topic.kind != "query":
+        assert (topic.model is not None) == (topic.kind == "json")
+        # Access rules compare keys, not payloads: on a shared key a recorder could publish an event of the plant's.
+        assert ("{role}" in topic.key) == (len(topic.senders) > 1)
+
+
+@given(st.text(max_size=40))
+def test_reading_a_key_never_raises_and_never_invents_a_topic(text: str) -> None:
+    assert read_key(text) is None
+    address = read_key(f"aeroloop/aero/{text}")
+    if address is not None:
+        again = key(address.topic.name, address.vehicle, session=address.session or "*", role=address.role or "*")
+        assert again == f"aeroloop/aero/{text}"
+
+
+# ── state tables of both ends, SPEC.md, sections 5 and 6 ──
+
+
+def reached(start: ControllerState, without: ControllerTrigger | None = None) -> set[ControllerState]:
+    """Every state of a controller that can be reached, the first included, without one of the triggers."""
+    found, fresh = {start}, {start}
+    while fresh:
+        edges = CONTROLLER_TABLE.items()
+        fresh = {after for (state, trigger), after in edges if state in fresh and trigger is not without} - found
+        found |= fresh
+    return found
+
+
+def test_any_plant_can_be_tripped_only_arming_clears_it_and_only_a_granted_one_is_driven() -> None:
+    edges = PLANT_TABLE.items()
+    assert {state for (state, trigger), after in edges if trigger is PlantTrigger.TRIP} == set(PlantState)
+    assert {after for (_, trigger), after in edges if trigger is PlantTrigger.TRIP} == {PlantState.TRIPPED}
+    out = {trigger for (state, trigger), after in edges if state is PlantState.TRIPPED is not after}
+    assert out == {PlantTrigger.ARM}
+    into = {goal: {edge for edge, after in edges if after is goal} for goal in (PlantState.GRANTED, PlantState.DRIVEN)}
+    assert into == {
+        PlantState.GRANTED: {(PlantState.IDLE, PlantTrigger.GRANT)},
+        PlantState.DRIVEN: {(state, PlantTrigger.COMMAND) for state in (PlantState.GRANTED, PlantState.DRIVEN)},
+    }
+
+
+def test_a_controller_stands_down_from_any_state_and_has_a_vehicle_only_by_a_grant() -> None:
+    aside = {ControllerState.HOLDING, ControllerState.FAULTED}
+    driving = {ControllerState.CLAIMED, ControllerState.READY, ControllerState.RUNNING}
+    for state in ControllerState:
+        assert CONTROLLER_TABLE[state, ControllerTrigger.STAND_DOWN] is ControllerState.HOLDING
+        assert reached(state) == set(ControllerState)  # none is without a way back
+    for state in aside:
+        assert reached(state, without=ControllerTrigger.RECALL) <= aside
+        assert CONTROLLER_TABLE[state, ControllerTrigger.RECALL] is ControllerState.SEARCHING
+    assert not reached(ControllerState.SEARCHING, without=ControllerTrigger.GRANT) & driving
+
+
+def test_a_trigger_that_the_table_does_not_have_is_refused_and_changes_nothing() -> None:
+    machine = Machine(PlantState.IDLE, PLANT_TABLE)
+    with pytest.raises(KeyError, match=r"idle.*command"):
+        machine.fire(PlantTrigger.COMMAND)
+    assert machine.state is PlantState.IDLE

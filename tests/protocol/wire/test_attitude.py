@@ -1,7 +1,7 @@
 """Attitude conventions (C.3)–(C.11): composition of rotations, kinematics, and no η on the wire.
 
 `rotate` below is Rodrigues' formula, with which the matrices are compared. T and S, by which they move, are tried in
-tests/plant_emulator/model/test_bodies.py.
+tests/plant_emulator/model/test_emulated.py.
 """
 
 from __future__ import annotations

@@ -1,16 +1,22 @@
-"""Quantizers of every kind: the bound (C.13), the definitions of (C.14) and SPEC.md."""
+"""Quantizers of every kind: the bound (C.13), the definitions of (C.14) and SPEC.md; and the same as expressions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from itertools import pairwise, product
 from math import copysign, inf, isnan, nan
-from typing import Any
+from threading import Event, Thread
+from typing import Any, Final
 
+import casadi as ca
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aeroloop.protocol.wire import expressions
+from aeroloop.protocol.wire.expressions import NUMBERS, as_written, numbers, with_numbers
 from aeroloop.protocol.wire.quantizer import (
     MAX_BITS,
     MIN_BITS,
@@ -22,6 +28,7 @@ from aeroloop.protocol.wire.quantizer import (
     Quantizer,
     UniformQuantizer,
 )
+from aeroloop.protocol.wire.symbolic import Compiled
 
 EPS = 2.0**-52
 PAST = 1 + 2.0**-40
@@ -224,3 +231,114 @@ UNIFORM, HELD, GROWING = UniformQuantizer, HysteresisQuantizer, LogarithmicQuant
 def test_parameters_out_of_bounds_are_refused(kind: Callable[..., Quantizer], wrong: tuple[Any, ...], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         kind(*wrong)
+
+
+# ── as expressions: every code and level to the last bit, beside the quantizers themselves ──
+
+
+KINDS: Final = UniformQuantizer, HysteresisQuantizer, LogarithmicQuantizer
+FIXED: Final[tuple[Quantizer, ...]] = (
+    *(kind(bits, limit) for kind in KINDS for bits in range(3, 17) for limit in (1.0, 24.0, 0.3)),
+    *(kind(bits, 24.0, 0.4, 7.0) for kind in KINDS[1:] for bits in (3, 8, 16)),
+    *(UniformQuantizer(bits, 1.0, 0.37) for bits in (2, 8, 16)),
+    HysteresisQuantizer(2, 24.0, 0.4, 0.05),
+    Continuous(24.0),
+)
+"""Quantizers whose parameters are constants of the expressions, as in a controller's tick."""
+
+
+def compiled(quantizer: Quantizer, parameters: ca.SX) -> Compiled:
+    """(y, held, code, parameters) ↦ (the code of y, the level of code, whether y saturates)."""
+    y, held, code = (ca.SX.sym(name) for name in ("y", "held", "code"))
+    with as_written():
+        encoded, level = expressions.encode(quantizer, y, held), expressions.level(quantizer, code)
+        found = [encoded, level, expressions.saturates(quantizer, y)]
+    names = ["y", "held", "code", "parameters"], ["encoded", "level", "saturates"]
+    return Compiled(ca.Function("quantizer", [y, held, code, parameters], found, *names))
+
+
+@cache
+def of_constants(which: int) -> Compiled:
+    return compiled(FIXED[which], ca.SX(0, 0))
+
+
+@cache
+def of_numbers(kind: type[Quantizer]) -> Compiled:
+    """One function for all quantizers of a kind, whose parameters are inputs, as in the compiled loop."""
+    parameters = ca.SX.sym("parameters", len(NUMBERS))
+    quantizer = next(quantizer for quantizer in FIXED if type(quantizer) is kind)
+    return compiled(with_numbers(quantizer, parameters), parameters)
+
+
+def same(a: float, b: float) -> bool:
+    """Equal to the last bit, the sign of a zero included; NaN equals NaN."""
+    return (isnan(a) and isnan(b)) or (a == b and copysign(1, a) == copysign(1, b))
+
+
+def assert_alike(quantizer: Quantizer, function: Compiled, values: Iterable[float], codes: Iterable[float]) -> None:
+    """Codes of consecutive values, what saturates, and levels of codes are the quantizer's."""
+    if len(function.inputs["parameters"]):
+        function.inputs["parameters"][:] = memoryview(array("d", numbers(quantizer)))
+    quantizer.reset()
+    held = nan
+    for y in values:
+        function.inputs["y"][0], function.inputs["held"][0] = y, held
+        function()
+        held, before = function.outputs["encoded"][0], quantizer.saturated
+        assert same(held, float(quantizer.encode(y))), (quantizer, y)
+        assert function.outputs["saturates"][0] == quantizer.saturated - before
+    for code in codes:
+        function.inputs["code"][0] = code
+        function()
+        assert same(function.outputs["level"][0], quantizer.level(code))
+
+
+def over_edges(quantizer: CodedQuantizer) -> Iterator[float]:
+    """Values within units in the last place of edges and just past them, each after the levels on either side."""
+    yield from (0.0, -0.0, inf, -inf, 5e-324, quantizer.limit, -quantizer.limit)
+    for i in {0, 1, 2, quantizer.top - 1, quantizer.top} & {*range(quantizer.top + 1)}:
+        if isinstance(quantizer, LogarithmicQuantizer):
+            edges = [quantizer.edges[i]]
+        else:
+            assert isinstance(quantizer, UniformQuantizer)
+            h = getattr(quantizer, "hysteresis", 0.0)
+            edges = [quantizer.deadzone + i * quantizer.step + side * h for side in (-1, 0, 1)]
+        for edge, past in product(edges, (1.0, 1 - 4 * EPS, 1 - EPS, 1 + EPS, 1 + 4 * EPS, 1 / PAST, PAST)):
+            for code in (i, min(i + 1, quantizer.top)):
+                yield from (quantizer.level(code), edge * past, -quantizer.level(code), -edge * past)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_at_every_edge_the_expressions_of_constants_and_of_numbers_give_the_quantizer_s_codes(
+    kind: type[CodedQuantizer],
+) -> None:
+    for which, quantizer in enumerate(FIXED):
+        if type(quantizer) is kind:
+            values = [*over_edges(quantizer)]
+            for function in (of_constants(which), of_numbers(kind)):
+                assert_alike(quantizer, function, values, (-quantizer.top - 1, -quantizer.top, -1, 0, 1, quantizer.top))
+
+
+@settings(max_examples=100)
+@given(quantizers, st.data())
+def test_codes_of_consecutive_values_and_levels_are_the_quantizer_s(quantizer: Quantizer, data: st.DataObject) -> None:
+    parts = data.draw(st.lists(st.floats(-1.3, 1.3), max_size=30))
+    top = quantizer.top if isinstance(quantizer, CodedQuantizer) else 0
+    codes = data.draw(st.lists(st.floats() if not top else st.integers(-top - 1, top), max_size=20))
+    assert_alike(quantizer, of_numbers(type(quantizer)), [part * quantizer.limit for part in parts], codes)
+
+
+def test_two_threads_never_build_as_written_at_once() -> None:
+    begun = Event()
+
+    def build() -> None:
+        with as_written(), as_written():  # nests in one thread
+            begun.set()
+
+    thread = Thread(target=build)
+    with as_written():
+        thread.start()
+        assert not begun.wait(0.05)  # time in which it would begin
+    thread.join()
+    assert begun.is_set()
+    assert ca.GlobalOptions.getSimplificationOnTheFly()

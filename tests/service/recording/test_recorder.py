@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, Status
@@ -24,15 +23,14 @@ from aeroloop.protocol.transport import history
 from aeroloop.protocol.transport.history import CachedPublisher, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
-from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, records
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
-from tests.support.cable import Cable
 from tests.support.edited_log import by_mcap, contents
 from tests.support.made_log import description, made
-from tests.support.zenoh_network import Gathering, eventually, free_port
+from tests.support.zenoh_network import Gathering, eventually
 
 KEY, TRACE = "aeroloop/aero/telemetry", "aeroloop/aero/trace/plant"
 DESCRIPTION, OWN_STATUS = "aeroloop/aero/description/plant", "aeroloop/aero/status/recorder"
@@ -189,28 +187,17 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert 0 < len(running.of("/aero/tf")) <= 11  # of a second; rows before the description are not decoded
 
 
-def test_a_recorder_that_ends_takes_what_caches_still_hold(gathering: Gathering, record: Record) -> None:
-    """It ends as soon as its cable is back and a new message has come: 0.9 MB were published meanwhile."""
-    port, count = free_port(), 600
-    published = Publisher(gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"])))
-    with Cable(port) as cable:
-        running = record(NetworkSettings(rendezvous=[], listen=[], connect=[cable.endpoint]))
-        published.send(1)
-        running.await_written()
-        cable.cut()
-        published.send(count, 1500)
-        cable.mend()
-
-        def received() -> bool:
-            published.send(published.count + 1)
-            written = [one.sequence for one in records(running.path) if isinstance(one, Message)]
-            return max(written) >= count
-
-        eventually("a new one", received)
-        running.end()
-    found = running.numbers()
-    assert found == list(range(len(found))), running.losses()
-    assert len(found) > count
+def test_a_recorder_that_ends_takes_what_caches_still_hold(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends as soon as it has recorded anything at all: most of the 0.9 MB is still with their publisher."""
+    monkeypatch.setattr(history, "ANSWER_S", 0.5)  # until a topic that nobody publishes counts as complete
+    published = Publisher(gathering.join())
+    published.send(600, 1500)
+    running = record()
+    running.await_written()
+    running.end()
+    assert running.numbers() == list(range(600)), running.losses()
     assert running.losses() == []
 
 

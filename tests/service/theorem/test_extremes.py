@@ -1,16 +1,18 @@
-"""Extremes of a reference: suprema that no instant of a long run exceeds."""
+"""Extremes of a reference, which no instant of a long run exceeds; and bounds of a plant."""
 
 from __future__ import annotations
 
-from math import pi
+from math import pi, sqrt
 
 import numpy as np
 import pytest
 
+from aeroloop.plant_emulator.model.emulated import rate_of
 from aeroloop.protocol.messages.operator import Sinusoid
-from aeroloop.service.config import load_over
+from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.reference import Angles, Floats, Trajectory
 from aeroloop.service.theorem.extremes import body_rates, chords, extremes, feedforward, vectors
+from aeroloop.service.theorem.premises import PlantBounds, plant_bounds
 from tests.support.certified import certified_settings
 
 NEARLY_EQUAL = Sinusoid(amplitude=(60, 50, 80), frequency=(0.04, 0.04006, 0.04002))
@@ -50,7 +52,7 @@ def test_no_instant_of_a_long_run_exceeds_the_extremes(reference: Sinusoid, step
 
 
 @pytest.mark.parametrize("reference", [NEARLY_EQUAL, "random"])
-def test_the_extremes_are_above_a_million_phases_and_near_the_largest(reference: Sinusoid | str) -> None:
+def test_the_extremes_are_above_those_of_many_phases_and_near_the_largest(reference: Sinusoid | str) -> None:
     """Frequencies that share no short period, so that every combination of phases comes, some day."""
     rng = np.random.default_rng(0)
     if isinstance(reference, str):
@@ -58,7 +60,7 @@ def test_the_extremes_are_above_a_million_phases_and_near_the_largest(reference:
         frequency = tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist())
         reference = Sinusoid(amplitude=amplitude, frequency=frequency)
     allowed, reached = bounds(reference), np.zeros(9)
-    for _ in range(10):
+    for _ in range(4):
         phases = rng.uniform(0, 2 * pi, (100_000, 3))
         near = np.round(phases[::2] / (pi / 2)) * pi / 2  # many extremes are near these
         phases[::2] = near + 0.1 * (phases[::2] - pi)
@@ -92,3 +94,38 @@ def test_no_attitude_along_the_reference_errs_by_more_than_its_chord() -> None:
         etas = [np.sqrt(1 - (v**2).sum(axis=1)) for v in (eps, wrong)]
         found = np.sqrt(3 * delta**2 + (etas[1] - etas[0]) ** 2).max()
         assert 0.9 * bound < found <= bound
+
+
+# ── bounds of a plant: lags of several motors, gyro noise, encoders that turn joint rates into ω ──
+
+
+def of(*changes: str) -> PlantBounds:
+    return plant_bounds(load_over(Settings(), ["loop.lockstep=true", *changes]), True)
+
+
+def test_rotors_that_rise_and_fall_err_beside_their_mean_lag_by_no_more_than_the_share() -> None:
+    """V̇ = (u − V)/T of two motors, for any of both lags: the torque's rate, beside (B u − B V)/lag."""
+    found = of("plant.rotor.lag_up_s=0.05", "plant.rotor.lag_down_s=0.2")
+    B = np.array(Settings().law.allocation)[1:, 1:]
+    gaps = np.random.default_rng(3).standard_normal((10_000, 2))
+    shares = []
+    for lags in ((0.05, 0.2), (0.2, 0.05), (0.05, 0.05), (0.2, 0.2)):
+        beside = (gaps / lags) @ B.T * found.lag - gaps @ B.T
+        shares.append((np.linalg.norm(beside, axis=1) / np.linalg.norm(gaps @ B.T, axis=1)).max())
+    assert 0.99 * found.uneven < max(shares) <= found.uneven
+    assert of("plant.rotor.lag_up_s=0.2", "plant.rotor.lag_down_s=0.2").uneven == 0
+
+
+def test_an_hour_of_gyro_noise_stays_within_its_bound_about_every_axis() -> None:
+    found = of("plant.sensors.rate=gyro", "plant.sensors.gyro_noise=0.01")
+    noise = np.abs(np.random.default_rng(5).standard_normal(3600 * 500 * 3)).max() * 0.01
+    assert 0.04 < noise < found.delta_omega / sqrt(3)
+
+
+def test_an_encoders_step_of_the_pitch_turns_the_rate_by_no_more_than_is_counted() -> None:
+    """At rest but for a yaw; ω is within the limit about every axis, the filter's ripple is counted beside it."""
+    counts, limit = (64, 4096), 1.0
+    few = of(f"plant.sensors.counts={list(counts)}")
+    yaw_rate = sqrt(2) * limit
+    true, seen = (rate_of(pitch, 0.0, yaw_rate) for pitch in (pi / 4, pi / 4 + 2 * pi / counts[0]))
+    assert 0.9 < np.linalg.norm(np.subtract(seen, true)) / (few.encoder.turn * limit) <= 1

@@ -22,8 +22,8 @@ from aeroloop.service.theorem.bounds import coordinates, lemma_1, rotation, theo
 from aeroloop.service.theorem.certificate import Paper, evaluate
 from tests.support import numpy_twin as twin
 from tests.support.adversary_loop import times as product
+from tests.support.law_tick import body_of
 from tests.support.lemma import Samples, lemma_inequalities
-from tests.support.twin_body import body_of
 
 LAW = AdaptiveSettings(
     inertia=(0.02, 0.03, 0.01),
