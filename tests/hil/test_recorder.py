@@ -52,7 +52,7 @@ def test_a_rotated_run_in_lockstep_holds_every_tick_and_is_reviewed_and_replayed
 def test_a_recorder_that_starts_late_and_one_that_was_killed_and_comes_back_have_it_from_the_first_tick(
     tmp_path: Path,
 ) -> None:
-    """The time away is the promise itself, so it is waited for; that the caches keep a minute: test_trace_rows.py.
+    """The time away is the promise itself, so it is waited for; that the caches keep a minute: test_history.py.
 
     Slack of a second before the kill: messages wait for up to 0.3 s before they are in a chunk, and a machine with two
     cores and other work keeps a process waiting for some hundred milliseconds.

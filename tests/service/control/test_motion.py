@@ -20,7 +20,16 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
-from aeroloop.service.control.motion import LEAST_TURN_S, Approach, Motion, approached, at_rest, shortest, to_set_point
+from aeroloop.service.control.motion import (
+    LEAST_TURN_S,
+    Approach,
+    Motion,
+    approached,
+    at_rest,
+    braked,
+    shortest,
+    to_set_point,
+)
 from aeroloop.service.control.reference import Angles, FollowError, Limits, Trajectory
 from tests.support.numpy_twin import Array, attitude_of, motion_of, rotation
 
@@ -399,3 +408,17 @@ def test_what_stays_within_the_limits_is_not_refused() -> None:
     for reference in (Sinusoid(), Hold(attitude=(0.0, 59.9, 7200.0)), Stream(), steep):
         Trajectory.of(reference).check(BENCH)
     Trajectory.of(ROLLS).check(BODY)
+
+
+def test_braking_has_the_rate_of_its_angle_and_the_acceleration_of_its_rate() -> None:
+    """Simpson's rule is exact for cubics, so the integrals are those of the rate and the acceleration to a rounding."""
+    random = np.random.default_rng(2)
+    for _ in range(20):
+        begin, times = Angles(*random.uniform(-1, 1, (3, 1, 3))), random.uniform(0.1, 3, 3)
+        for axis in range(3):
+            s = np.linspace(0, times[axis], 3)
+            angle, rate, acceleration = (part[:, axis] for part in braked(begin, times, s))
+            weights = np.array([1, 4, 1]) * times[axis] / 6
+            assert angle[2] - begin.angle[0, axis] == pytest.approx(weights @ rate, abs=1e-14)
+            assert rate[2] - begin.rate[0, axis] == pytest.approx(weights @ acceleration, abs=1e-14)
+            assert (rate[2], acceleration[2]) == pytest.approx((0, 0), abs=1e-14)
