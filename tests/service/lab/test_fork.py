@@ -266,7 +266,7 @@ def test_a_log_that_cannot_be_read_is_a_row_and_a_wrong_override_is_an_error(cor
 
 
 def test_files_of_a_rotated_run_are_one_log(tmp_path: Path) -> None:
-    names = ("a.mcap", "a-0001.mcap", "a-0002.mcap", "b.mcap", "b-decoded.mcap")
+    names = ("a.mcap", "a-0001.mcap", "a-0002.mcap", "b.mcap", "b-copy.mcap")
     for name in names:
         (tmp_path / name).touch()
     assert [[file.name for file in log] for log in logs_of([tmp_path])] == [
