@@ -33,7 +33,7 @@ def op(hil: Hil, *words: str, code: int = 0) -> str:
     return said
 
 
-@pytest.mark.parametrize("transmit", [pytest.param("periodic", marks=pytest.mark.smoke), "on_change"])
+@pytest.mark.parametrize("transmit", ["periodic", "on_change"])
 def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_again_to_the_last_bit(
     hil: Hil, transmit: str
 ) -> None:

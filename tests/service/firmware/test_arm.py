@@ -93,6 +93,7 @@ int main(void)
 @pytest.mark.skipif(
     not COMPILERS or not all(map(shutil.which, NEEDED)), reason=f"needs {' and '.join(NEEDED)}, and a compiler for here"
 )
+@pytest.mark.realtime  # no need of real time; another processor
 @pytest.mark.parametrize("floats", ["soft", "hard"])
 def test_quantizers_and_node_give_the_same_bits_on_arm_as_here(floats: str, tmp_path: Path) -> None:
     """By a digest over 100 000 codes and levels, and all that the node does in 20 000 ticks."""
