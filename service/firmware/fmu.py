@@ -16,7 +16,8 @@ from xml.sax.saxutils import quoteattr
 from zipfile import ZIP_DEFLATED, ZipFile
 
 from aeroloop.service.config import Settings
-from aeroloop.service.firmware.export import SOURCES, export, header
+from aeroloop.service.firmware.configuration import header
+from aeroloop.service.firmware.export import SOURCES, export
 from aeroloop.service.firmware.machines import compiled
 from aeroloop.service.firmware.plant import write_plant
 

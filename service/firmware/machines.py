@@ -94,7 +94,8 @@ class Program:
     def _run(self, *command: str) -> str:
         done = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)  # noqa: S603  # ours
         if done.returncode:
-            raise ExportError(f"{' '.join(command)}: {(done.stderr or done.stdout).strip()}")
+            said = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
+            raise ExportError(f"{command[0]} failed: {said[0]}")
         return done.stdout.strip()
 
 

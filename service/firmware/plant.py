@@ -8,7 +8,8 @@ from pathlib import Path
 
 from aeroloop.plant_emulator.model.emulated import Sensors, initially, sensor_function, step_function
 from aeroloop.service.config import Settings
-from aeroloop.service.firmware.export import SOURCES, ExportError, braced, c_source, header
+from aeroloop.service.firmware.configuration import header
+from aeroloop.service.firmware.export import SOURCES, ExportError, braced, c_source
 
 
 def write_plant(settings: Settings, folder: Path) -> list[Path]:
