@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +14,20 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("protocol", "plant_emulator", "service")
+
+
+@pytest.fixture(scope="session")
+def package_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which `aeroloop` is a package of links to the sources.
+
+    An editable installation maps names to folders by an import hook, which mypy and import-linter do not follow.
+    """
+    folder = tmp_path_factory.mktemp("tree")
+    package = folder / "aeroloop"
+    package.mkdir()
+    for source in [*(ROOT / "service/api").iterdir(), *(ROOT / name for name in PACKAGES)]:
+        (package / source.name).symlink_to(source)
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -26,10 +41,18 @@ PACKAGES = ("protocol", "plant_emulator", "service")
     ],
     ids=" ".join,
 )
-def test_the_house_is_kept(check: tuple[str, ...]) -> None:
+def test_the_house_is_kept(check: tuple[str, ...], package_tree: Path) -> None:
     command = [str(Path(sys.executable).parent / check[0]), *check[1:]]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONPATH": str(package_tree), "MYPYPATH": str(package_tree)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_pip_and_uv_install_the_same_versions() -> None:
+    uv_pins = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["uv"]["constraint-dependencies"]
+    lines = (ROOT / ".ci/constraints.txt").read_text().splitlines()
+    pip_pins = [line for line in lines if not line.startswith("#")]
+    assert pip_pins == uv_pins
 
 
 def test_every_folder_of_code_is_in_the_wheel() -> None:

@@ -1,12 +1,14 @@
 """The fit of the emulated Aero to two of the paper's cells, and what the predicted tables depend on.
 
-uv run python -m tests.benchmarks.fit
+uv run python -m tests.benchmarks.fit            # or with names of `CHANGES`, for these alone
 
 Newton's method fits yaw friction and height to the calm cell without quantization, the wind to the windy one, from what
 others measured. Then come the tables' errors after each change of what was not fitted, and how open a fit leaves it: 7
 bits of the input stand for every row of Tables C.2 and C.3. ± are standard deviations of a least-squares fit to the
 eight figures of Table C.4, which scatter as the published cells do about their column means.
 """
+
+import sys
 
 import numpy as np
 
@@ -65,13 +67,14 @@ def main() -> None:
     row = [Cell(out, 7) for out in OUTPUT_BITS] + [Cell(8, 6, windy=True)]
     corners = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
     probes = [overrides(p) for p in (x, *(x + np.diag(0.1 * SCALE)))]
+    names = sys.argv[1:] or list(CHANGES)
     with open_workers() as workers:
         print(f"fitted: {fit(workers)}; configured: {x[:4]}")
-        changed = [run_of(load(overrides=o), cell.overrides) for o in CHANGES.values() for cell in row]
+        changed = [run_of(load(overrides=CHANGES[name]), cell.overrides) for name in names for cell in row]
         fitted = [run_of(load(overrides=o), cell.overrides) for o in probes for cell in corners]
         tables, fits = np.array(run_cells(workers, changed)), np.array(run_cells(workers, fitted))
     fits = fits.reshape(len(probes), len(corners), 2)
-    for name, (*calm, windy) in zip(CHANGES, tables.reshape(-1, len(row), 2), strict=True):
+    for name, (*calm, windy) in zip(names, tables.reshape(-1, len(row), 2), strict=True):
         published = np.array([Z_TRACK, U_TOTAL])  # the last of each is fitted
         errors = np.abs(np.array(calm).T[:, None] / published - 1).reshape(2, -1)[:, :-1].mean(axis=1)
         print(f"{name:34s} {errors[0]:6.1%} {errors[1]:7.2%} {np.abs(windy / TABLE_C4[3] - 1).mean():6.1%}")

@@ -17,6 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
+
+from aeroloop import read_run
 from aeroloop.service.config import load
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
 
@@ -50,17 +53,25 @@ def turn(seconds: float, rate_hz: float, overrides: Sequence[str], z_track: floa
         settings = standalone(load(overrides=overrides), Path(folder) / "log.mcap", duration_s=seconds)
         with ProcessGroup(settings) as processes:
             processes.start_loop(environment={})  # an interpreter each, as a user starts them: forks would share memory
-            time.sleep(2 + seconds / 2)  # from a controller's start to its session some 2 s pass
+            processes.eventually("a session", lambda: _state_of_plant(processes) == "driven", PATIENCE_S)
+            time.sleep(seconds / 2)
             memory = max(memory_mb(processes.pid(role)) for role in ROLES)
             processes.eventually("its end", lambda: not processes.running("controller"), seconds + PATIENCE_S)
             plant = processes.statuses["plant"]
         review = json.loads(run("log", "review", f"{folder}/log.mcap", "--json"))
+        latency_ns = read_run(f"{folder}/log.mcap").ticks.latency_ns
     broken = [f"{review['sessions']} sessions instead of one"] if review["sessions"] != 1 else []
-    in_time = sum(count for begin_us, count in review["timing"]["latency"]["bins"] if begin_us < 1e6 / rate_hz)
+    in_time = int(np.count_nonzero(latency_ns < 1e9 / rate_hz))  # the latency of a skipped tick is NaN
     ticks = round(seconds * rate_hz) - 1  # the last one ends the session
     notes = [*broken, *plant.notes, *review["trips"], *review["damages"]]
     over_lockstep = review["z_track"] / z_track
     return Turn(ticks, in_time, review["skipped_ticks"], review["latency_us"], over_lockstep, memory, notes)
+
+
+def _state_of_plant(processes: ProcessGroup) -> str | None:
+    """State by the plant's last status; None before the first."""
+    status = processes.statuses.get("plant")
+    return None if status is None else status.state
 
 
 def run(*words: str) -> str:
