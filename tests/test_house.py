@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -17,14 +18,16 @@ PACKAGES = ("protocol", "plant_emulator", "service")
 
 
 @pytest.fixture(scope="session")
-def package_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def package_tree() -> Path:
     """A folder in which `aeroloop` is a package of links to the sources.
 
-    An editable installation maps names to folders by an import hook, which mypy and import-linter do not follow.
+    An editable installation maps names to folders by an import hook, which mypy and import-linter do not follow. The
+    folder is the same each time, because mypy's cache is of paths.
     """
-    folder = tmp_path_factory.mktemp("tree")
+    folder = ROOT / ".tree_cache"
+    shutil.rmtree(folder, ignore_errors=True)
     package = folder / "aeroloop"
-    package.mkdir()
+    package.mkdir(parents=True)
     for source in [*(ROOT / "service/api").iterdir(), *(ROOT / name for name in PACKAGES)]:
         (package / source.name).symlink_to(source)
     return folder
