@@ -19,7 +19,7 @@ LONGEST_S: Final = 300.0
 RUNS: Final = {
     "tests.benchmarks": ["--turns=1", "--seconds=2", "--log-s=1"],
     "tests.benchmarks.console": ["1"],
-    "tests.benchmarks.design": ["30", "30", "--duration=1", "--set=law.damping_bound=0.0126"],
+    "tests.benchmarks.design": ["4", "40", "--duration=1", "--set=law.damping_bound=0.0126"],
     "tests.benchmarks.firmware": [],
     "tests.benchmarks.fit": ["as configured"],
     "tests.benchmarks.loss": ["--seconds=3", "--transport", "mixed", "--", "loss=0"],

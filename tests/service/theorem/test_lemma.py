@@ -70,7 +70,7 @@ def random_samples(wire: WireSpec, b: Paper, seed: int) -> tuple[Samples, Floats
     omega = rng.uniform(-0.9, 0.9, (COUNT, 3))
 
     aimed = rng.random(COUNT) < 0.5
-    diagonals = rng.choice([-1.0, 1.0], (COUNT, 3))
+    diagonals = rng.choice(np.array([-1.0, 1.0]), (COUNT, 3))
     q[aimed] = q_d[aimed] = turns(diagonals, np.full(COUNT, 2 * _edge_before(b.known.half_angle_d, wire)))[aimed]
     # No error at all: z = 0, where what grows with ‖z‖ does not hide the rest. And no faster than the reference.
     omega[aimed] = _edges(wire, b.known.k_omega_d / sqrt(3), rng)[aimed]
@@ -96,7 +96,8 @@ def _edges(wire: WireSpec, most: float, rng: np.random.Generator) -> Floats:
     """Values beside the edges of the rate's cells, up to ±most [rad/s]. Shape (COUNT, 3)."""
     step = 2 * wire.rate.quantizer().bound
     cells = floor(most / step - 0.5)
-    edges: Floats = (rng.integers(-cells, cells + 1, (COUNT, 3)) + rng.choice([-0.499, 0.499], (COUNT, 3))) * step
+    beside = rng.choice(np.array([-0.499, 0.499]), (COUNT, 3))
+    edges: Floats = (rng.integers(-cells, cells + 1, (COUNT, 3)).astype(np.float64) + beside) * step
     return edges
 
 
