@@ -302,7 +302,7 @@ def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) ->
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False  # as Zenoh here: names of hosts do not matter
     # The hello of OpenSSL 3.5 has keys of 1 kB. A plain peer of Zenoh takes its first bytes for the length of a message
-    # that has come whole, and hangs up at once; a shorter hello it waits to be completed, which is how it is recognised below.
+    # that has come whole, and hangs up at once. It waits for the rest of a shorter hello, which shows that it is plain.
     context.set_ecdh_curve("prime256v1")
     remedy = f"compare the clocks and {AUTHORITY} of both hosts, or issue it anew with `aeroloop host keys issue`"
     plain_text = f"{text} does not speak TLS: has its process a network.security.directory?"
