@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.operator import Reference, Sinusoid
+from aeroloop.protocol.messages.operator import AS_PUBLISHED, Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings, counter_fills_frame
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.spec import LoopSettings, SignalBits, WireSpec
@@ -165,7 +165,7 @@ def from_description(config: dict[str, Any]) -> Settings:
     """
     if missing := [name for name in Settings.model_fields if name not in config]:
         raise ConfigError(f"a description without {', '.join(missing)}")
-    settings = valid(Settings, config, extra="ignore")
+    settings = valid(Settings, config, extra="ignore", context=AS_PUBLISHED)
     if isinstance(settings.law, CustomLawSettings):  # keys of a user's law, which are not ours to know
         return settings.model_copy(update={"law": CustomLawSettings.model_validate(config["law"])})
     return settings

@@ -152,9 +152,14 @@ def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Targ
     return valid(Target, {name: each for name, each in tree.items() if closest(name, sections) not in OTHER_SECTIONS})
 
 
-def valid(model: type[ModelT], tree: dict[str, Any], extra: Literal["ignore"] | None = None) -> ModelT:
+def valid(
+    model: type[ModelT],
+    tree: dict[str, Any],
+    extra: Literal["ignore"] | None = None,
+    context: dict[str, bool] | None = None,
+) -> ModelT:
     """A model of a tree. Raises ConfigError, with a line for each mistake."""
     try:
-        return model.model_validate(tree, extra=extra)
+        return model.model_validate(tree, extra=extra, context=context)
     except ValidationError as error:
         raise ConfigError("; ".join(problems(error, model))) from None

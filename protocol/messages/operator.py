@@ -20,6 +20,7 @@ from pydantic import (
     SerializerFunctionWrapHandler,
     StringConstraints,
     ValidationError,
+    ValidationInfo,
     model_serializer,
     model_validator,
 )
@@ -90,12 +91,28 @@ class Hold(Message):
     )
 
 
+AS_PUBLISHED: Final = {"as_published": True}
+"""Context of validation for what a role published, perhaps one of a version that had no `Points.interpolation`."""
+
+
 class Points(Message):
     """Attitudes at given times, joined smoothly, from rest to rest; the last one is held."""
 
     kind: Literal["points"] = Field(default="points", description="which reference")
     times: list[FiniteFloat] = Field(min_length=2, max_length=MAX_POINTS, description="rising, from 0 [s]")
     attitudes: list[Angles] = Field(min_length=2, max_length=MAX_POINTS, description="roll, pitch, yaw each [deg]")
+    interpolation: Literal["monotone", "differences"] = Field(
+        default="monotone",
+        description="monotone: between two points each angle stays between theirs; differences: smoother where the "
+        "points are dense, and far beyond them where they are not. Left out in a log, it is differences",
+    )
+
+    @model_validator(mode="after")
+    def _as_it_was_joined(self, info: ValidationInfo) -> Points:
+        """Join the points of an older log as the controller did that followed them."""
+        if info.context == AS_PUBLISHED and "interpolation" not in self.model_fields_set:
+            return self.model_copy(update={"interpolation": "differences"})
+        return self
 
     @model_validator(mode="after")
     def _a_time_for_each(self) -> Points:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
-from aeroloop.protocol.messages.operator import Change, Message, in_force
+from aeroloop.protocol.messages.operator import AS_PUBLISHED, Change, Message, in_force
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS, LoopSettings, WireSpec
 
@@ -208,7 +208,7 @@ def read_batch(payload: bytes) -> Batch | None:
     if len(payload) != HEADER_BYTES + rows * kinds.itemsize + tail_bytes:
         return None
     try:
-        tail = Tail.model_validate_json(payload[-tail_bytes:]) if tail_bytes else Tail()
+        tail = Tail.model_validate_json(payload[-tail_bytes:], context=AS_PUBLISHED) if tail_bytes else Tail()
     except ValidationError:
         return None
     return Batch(header, read_columns(header, payload), tail)

@@ -94,7 +94,7 @@ class Trajectory(NamedTuple):
     def of(cls, reference: Reference) -> Trajectory:
         """The trajectory of a reference that begins at t = 0. A stream holds 0 until its first set-point."""
         if isinstance(reference, Points):
-            return cls._through(np.array(reference.times), np.radians(np.array(reference.attitudes)))
+            return cls._through(reference)
         still = cls._polynomial(np.zeros(1), np.zeros((1, POWERS, 3)))
         if isinstance(reference, Sinusoid):
             amplitude = np.array([[a * (pi / 180) for a in reference.amplitude]])
@@ -108,11 +108,17 @@ class Trajectory(NamedTuple):
         return cls(starts, quintic, np.zeros((len(starts), 3)), np.zeros((len(starts), 3)))
 
     @classmethod
-    def _through(cls, times: Floats, angles: Floats) -> Trajectory:
-        """A trajectory through points, with rates and accelerations by differences; at rest at both ends."""
+    def _through(cls, points: Points) -> Trajectory:
+        """A trajectory through points, at rest at both ends."""
+        times, angles = np.array(points.times), np.radians(np.array(points.attitudes))
+        monotone = points.interpolation == "monotone"
         rates = np.gradient(angles, times, axis=0)
+        if monotone:
+            rates[1:-1] = _monotone_rates(times, angles, rates[1:-1])
         rates[0] = rates[-1] = 0.0
         accelerations = np.gradient(rates, times, axis=0)
+        if monotone:
+            accelerations[1:-1] = _monotone_accelerations(times, angles, rates, accelerations[1:-1])
         accelerations[0] = accelerations[-1] = 0.0
         here = Angles(angles[:-1], rates[:-1], accelerations[:-1])
         there = Angles(angles[1:], rates[1:], accelerations[1:])
@@ -215,23 +221,26 @@ class Trajectory(NamedTuple):
         terms = np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
         return self.largest(Angles.speeds, terms)
 
+    def steepest(self) -> float:
+        """The largest angle between the body's z axis and the vertical [rad]."""
+        terms = np.array([[0.5, *turning(self.peaks()[0])[:2], 0]])
+        return 2 * asin(min(1.0, self.largest(lambda at: np.sin(at.tilts() / 2), terms)))
+
     def check(self, limits: Limits) -> None:
         """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
         with np.errstate(over="ignore", invalid="ignore"):  # a rate that is not finite counts as too fast
-            fastest, angle = self.fastest(), self.peaks()[0]
-            half = self.largest(lambda at: np.sin(at.tilts() / 2), np.array([[0.5, *turning(angle)[:2], 0]]))
+            fastest, tilt = self.fastest(), self.steepest()
         if not fastest <= limits.rate * _LIMIT_SLACK:
             raise FollowError(
                 f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
                 f"{limits.rate:g} rad/s, however it is approached: make it slower or smaller"
             )
-        tilt = 2 * asin(min(1.0, half))
         if tilt > limits.tilt * _LIMIT_SLACK:
             raise FollowError(
                 f"the reference itself tilts by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
                 f"{degrees(limits.tilt):g}°, however it is approached"
             )
-        if not limits.rolls and angle[0] > 0:
+        if not limits.rolls and self.peaks()[0, 0] > 0:
             raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
 
 
@@ -254,6 +263,46 @@ def _locked(amplitude: Floats, frequency: Floats) -> Floats:
         rows.append(row)
         left = [i for i in left if i not in near]
     return np.array(rows).reshape(-1, 3)
+
+
+# ── points without overshoot ──
+#
+# The rate of a quintic that goes on by D in T seconds, from rate v to w and acceleration a to b, is a quartic. Its
+# coefficients in Bernstein's polynomials are v, v + aT/4, 5D/T − 2(v + w) − (a − b)T/4, w − bT/4 and w. Where none of
+# them has another sign than D, the angle never turns back, so it stays between the two points. As Fritsch and Carlson
+# do it for cubics ("Monotone piecewise cubic interpolation", SIAM J. Numer. Anal. 17, 1980), rates and accelerations
+# are differences that are reduced until that holds.
+
+_STEEPEST: Final = 1.25
+"""Largest rate at a point, as a multiple of D/T on either side: then 5D/T − 2(v + w) has the sign of D."""
+
+
+def _monotone_rates(times: Floats, angles: Floats, differences: Floats) -> Floats:
+    """Rates at all points but the first and the last: 0 where the angle turns back. Shape (n − 2, 3)."""
+    slopes = np.diff(angles, axis=0) / np.diff(times)[:, None]
+    before = slopes[:-1]
+    after = slopes[1:]
+    goes_on = np.sign(before) == np.sign(after)
+    most = np.where(goes_on, _STEEPEST * np.minimum(np.abs(before), np.abs(after)), 0.0)
+    return np.clip(differences, -most, most)
+
+
+def _monotone_accelerations(times: Floats, angles: Floats, rates: Floats, differences: Floats) -> Floats:
+    """Accelerations at all points but the first and the last, by `rates` at all of them. Shape (n − 2, 3)."""
+    lengths = np.diff(times)[:, None]
+    ways = np.diff(angles, axis=0)
+    begin = np.abs(rates[:-1])
+    end = np.abs(rates[1:])
+    # Of the third coefficient each end may take half; of the second and the fourth, what its own rate leaves.
+    middle = np.maximum(0.0, 2 * (5 * np.abs(ways) / lengths - 2 * (begin + end)) / lengths)
+    rises = ways > 0
+    least_begin = np.where(rises, -4 * begin / lengths, -middle)
+    most_begin = np.where(rises, middle, 4 * begin / lengths)
+    least_end = np.where(rises, -middle, -4 * end / lengths)
+    most_end = np.where(rises, 4 * end / lengths, middle)
+    least = np.maximum(least_end[:-1], least_begin[1:])
+    most = np.minimum(most_end[:-1], most_begin[1:])
+    return np.clip(differences, least, most)
 
 
 def join(here: Angles, there: Angles, length: Floats) -> Floats:

@@ -292,7 +292,11 @@ def rest_of_reference(last: SessionRecord, period: float) -> Reference:
     if len(ahead) < 2:
         return Hold(attitude=reference.attitudes[-1])
     times, first = reference.times[ahead[0] :], reference.times[ahead[0]]
-    return Points(times=[time - first for time in times], attitudes=reference.attitudes[ahead[0] :])
+    return Points(
+        times=[time - first for time in times],
+        attitudes=reference.attitudes[ahead[0] :],
+        interpolation=reference.interpolation,
+    )
 
 
 def hold_here(attitude: Quaternion, *, rolls: bool) -> Vector:

@@ -22,6 +22,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
+from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures, Floats, Integers, figures
 from aeroloop.service.lab.lockstep import LockstepLoop
 from aeroloop.service.lab.loop_function import Course, loop_of
@@ -72,10 +73,13 @@ def experiment(
         controller: Controller to run; the configuration's if None.
 
     Raises:
+        FollowError: A controller would refuse the reference: it is beyond `controller.max_reference_rate` or
+            `max_reference_tilt_deg`, or rolls a vehicle that cannot.
         LoopEndedError: The plant tripped.
         PluginError, PlantError: The configured plant is not there, or failed.
         ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
     """
+    Trajectory.of(settings.reference).check(Limits.of(settings.controller, settings.wire.actuators))
     if watch is None and plant is None and controller is None:
         course = _as_one_function(settings, duration_s, progress)
         if course is not None:
@@ -103,7 +107,8 @@ def run_experiment(
     """Run controller and plant in lockstep in this process; it repeats bit for bit. Returns the figures of merit.
 
     `settings` are the defaults (the paper's experiment at 8 and 6 bits) if None; other arguments as of `experiment`.
-    Raises ValueError if the plant trips, or the configuration makes no loop.
+    Raises ValueError if the plant trips, or the configuration makes no loop, and FollowError for a reference that a
+    controller would refuse.
     """
     return experiment(settings or load(), duration_s, progress, watch, plant=plant, controller=controller).figures
 

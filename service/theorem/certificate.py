@@ -2,7 +2,8 @@
 
 For every law in `feedback`: a bound of the error at every instant, by `invariant`, for the paper's body and for
 the configured plant. The certificate holds if the plant's set is proven and lies within all that the proof presumes:
-the wire's ranges, the voltages within reach, half a turn, the bound of the damping. Of the paper's law also condition
+the wire's ranges, the voltages within reach, half a turn, the bound of the damping; and within the limits beyond which
+the plant trips, or the daemon refuses the reference. Of the paper's law also condition
 (C.66) with its terms, by `bounds`: a law in continuous time, so nothing of a sampled loop is concluded from it.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import asin, degrees, floor, hypot, inf, radians, sin
+from math import asin, degrees, floor, hypot, inf, pi, radians, sin
 from typing import Any, Final, NamedTuple, get_type_hints
 
 import numpy as np
@@ -22,6 +23,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.motion import START_WITHIN_DEG
+from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.extremes import BoundlessError, Extremes, extremes, motors
 from aeroloop.service.theorem.invariant import Reach, reach, without_error
@@ -60,11 +62,13 @@ class Certificate(BaseModel):
         description="plant_radius if θ̂ stayed at its first value (law.kind = 'nonadaptive'); null where none is proven"
     )
     delay_ms: float | None = Field(
-        description="largest further delay of commands with which it still holds [ms]; null where it does not hold"
+        description="largest further delay of commands with which it still holds, and which the plant's watchdog lets "
+        "pass [ms]; null where it does not hold"
     )
     lost_frames: int | None = Field(
-        description="most frames lost in a row, if none is late, with which it still holds; null likewise, and of a "
-        "law with an integral, which does not advance without a measurement"
+        description="most frames lost in a row, if none is late, with which it still holds, and with which neither "
+        "the plant nor the controller ends the session; null where it does not hold, and of a law with an integral, "
+        "which does not advance without a measurement"
     )
     assumptions: list[str] = Field(description="what is assumed, each with the key or the option that states it")
     violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
@@ -115,8 +119,11 @@ def evaluate(settings: Settings, *, disturbance: float | None = None, late_s: fl
     feedback_of(settings.law)  # raises before anything is computed
     desired = extremes(settings)
     bounds = plant_bounds(settings, disturbance is not None)
-    if bounds.held_roll and desired.rolls:
-        bounds = replace(bounds, unproven=[*bounds.unproven, "reference: it rolls, and the plant's roll is held"])
+    limits = Limits.of(settings.controller, settings.wire.actuators)
+    try:
+        Trajectory.of(settings.reference).check(limits._replace(rolls=not bounds.held_roll))
+    except FollowError as error:
+        bounds = replace(bounds, unproven=[*bounds.unproven, str(error)])
     body = premises(settings, desired, PlantBounds(settings.loop.period), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
     body_reach, plant_reach = reach(body), reach(plant)
@@ -156,12 +163,25 @@ def certify(
         ValueError: A disturbance that is no number, or negative.
     """
     e = evaluate(settings, disturbance=disturbance, late_s=late_s)
-    return _certificate(settings, e, disturbance, margins)
+    return _certificate(settings, e, disturbance, margins, late_s)
 
 
-def _certificate(settings: Settings, e: Evaluated, disturbance: float | None, margins: bool) -> Certificate:
+def _certificate(
+    settings: Settings, e: Evaluated, disturbance: float | None, margins: bool, late_s: float = 0.0
+) -> Certificate:
     violated = _violated(settings, e, e.plant, e.plant_reach)
-    delay = _largest_delay(settings, e) if margins and not violated else None
+    patience = patience_of(settings)
+    if late_s > patience.delay_s + RESOLUTION_S:
+        violated.append(
+            f"plant.watchdog_s = {settings.plant.watchdog_s:g} s, and commands come {late_s * 1e3:.4g} ms later"
+        )
+    delay = None
+    lost_frames = None
+    if margins and not violated:
+        delay = _largest_delay(settings, e, max(patience.delay_s - late_s, 0.0))
+        if not any(e.plant.law.ki):
+            ticks = floor(delay / settings.loop.period + RESOLUTION_S)
+            lost_frames = min(ticks // patience.heartbeat_ticks, patience.lost_frames)
     law = e.plant.law
     constant = replace(e.plant, law=law._replace(reach=0.0, Gamma=(0.0, 0.0, 0.0)))
     reached = (e.body_reach, e.plant_reach, reach(constant) if law.reach else e.plant_reach)
@@ -176,7 +196,7 @@ def _certificate(settings: Settings, e: Evaluated, disturbance: float | None, ma
         plant_deg=plant_deg,
         constant_radius=constant_radius,
         delay_ms=None if delay is None else floor(delay * 1e5) / 100,
-        lost_frames=None if delay is None or any(law.ki) else floor(delay / settings.loop.period),
+        lost_frames=lost_frames,
         assumptions=list(_assumptions(settings, e, disturbance)),
         violated=violated,
         terms=list(_terms(e)),
@@ -228,8 +248,32 @@ def promise(settings: Settings, changes: Sequence[Change] = (), described: Mappi
     return Promise(law, certificate, bounds, certificate.verdict)
 
 
-def _largest_delay(settings: Settings, e: Evaluated) -> float:
-    """The largest further age of a command with which it holds, within `RESOLUTION_S` below [s].
+class Patience(NamedTuple):
+    """What both ends wait for before they end a session."""
+
+    delay_s: float  # longest further delay of all commands [s]
+    lost_frames: int  # most frames lost in a row
+    heartbeat_ticks: int  # ticks from one frame to the next, at the most: 1 unless frames are sent on change
+
+
+def patience_of(settings: Settings) -> Patience:
+    """What the plant's watchdog (`Freshness` of its endpoint) and `controller.stale_s` let pass.
+
+    A plant trips at the tick that is its watchdog's time after the last fresh command.
+    """
+    loop, wire = settings.loop, settings.wire
+    heartbeat_ticks = 1
+    if "on_change" in (wire.transmit.measurement, wire.transmit.command) and not loop.lockstep:
+        heartbeat_ticks = wire.transmit.heartbeat_ticks(loop.period_ns, wire.measurement.counters)
+    watchdog_ticks = max(1, round(settings.plant.watchdog_s / loop.period))
+    delay_s = max(0, watchdog_ticks - heartbeat_ticks) * loop.period
+    stale_ticks = floor(settings.controller.stale_s / loop.period + RESOLUTION_S)
+    frames = min(watchdog_ticks, stale_ticks) // heartbeat_ticks
+    return Patience(delay_s, max(0, frames - 1), heartbeat_ticks)
+
+
+def _largest_delay(settings: Settings, e: Evaluated, most_s: float) -> float:
+    """The largest further age of a command, up to `most_s`, with which it holds, within `RESOLUTION_S` below [s].
 
     A command is as old as its measurement until the next one replaces it: hold + delay + frames lost · period. So one
     bisection gives both, the largest delay and the most frames lost in a row.
@@ -239,7 +283,7 @@ def _largest_delay(settings: Settings, e: Evaluated) -> float:
         later = replace(e.plant, plant=replace(e.plant.plant, age=e.plant.plant.age + delay))
         return not _violated(settings, e, later, reach(later))
 
-    low, high = 0.0, MOST_DELAY_S
+    low, high = 0.0, min(most_s, MOST_DELAY_S)
     if holds(high):
         return high
     while high - low > RESOLUTION_S:
@@ -262,21 +306,36 @@ def _violated(settings: Settings, e: Evaluated, p: Premises, at: Reach | None) -
     for symbol, value, unit, most, name in beyond(settings, p, at or without_error(p)):
         allowed, reached = f"{name} = {most:g} {unit}".rstrip(), f"{value:.3g} {unit}".rstrip()
         found.append(f"{allowed}, and {symbol} may reach {reached} by {where}")
-    return found if at else [*found, _unproven(p, e.body)]
+    if at is None:
+        return [*found, _unproven(p, e.body)]
+    quantizer = settings.wire.voltage.quantizer()
+    full = min(quantizer.outermost, settings.plant.voltage_limit)
+    volts = largest_voltage(settings, p.desired, at)
+    if volts + quantizer.bound > full and not any(reason.startswith("saturation") for reason in found):
+        found.append(
+            f"trip: at {full:g} V, full voltage, a motor counts as saturated (plant.limits.max_saturated_s), and |u_k| "
+            f"of {volts:.3g} V may be quantized to it"
+        )
+    return found
 
 
 def beyond(settings: Settings, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
     """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
     wire = settings.wire
     limit = min(wire.voltage.limit, settings.plant.voltage_limit, p.law.volts)
-    rate = at.axis_rate + p.delta_omega + p.plant.encoder.ripple
+    # The plant judges itself by its own sensors; an encoder's angle errs by twice as much as its ε_k.
+    tilt = min(pi, p.desired.tilt + 2 * asin(at.eps_e) + 2 * p.plant.delta_eps)
+    speed = p.desired.rate + at.omega_e + at.rate_error
+    trips = settings.plant.limits
     ranges = (
-        ("|ω_k|", rate, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
+        ("|ω_k|", at.axis_rate + at.rate_error, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
         ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
         ("|u_k|", largest_voltage(settings, p.desired, at), "V", limit, "saturation: wire.voltage.limit"),
         ("|θ̂_d|", at.integral, "N·m", p.law.torque, "law.torque_bound"),
+        ("the tilt", degrees(tilt), "°", trips.max_tilt_deg, "trip: plant.limits.max_tilt_deg"),
+        ("‖ω‖", speed, "rad/s", trips.max_rate, "trip: plant.limits.max_rate"),
     )
-    return [each for each in ranges if each[1] > each[3]]
+    return [reached for reached in ranges if reached[1] > reached[3]]
 
 
 def largest_voltage(settings: Settings, desired: Extremes, at: Reach) -> float:

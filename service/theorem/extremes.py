@@ -39,10 +39,10 @@ class Extremes(NamedTuple):
     jerk: float  # largest ‖ω̈_d‖ [rad/s³]
     axis_rate: float  # largest element of ω_d in the desired body frame [rad/s]
     half_angle: float  # half the largest angle of q_d from [1, 0], at most π/2 [rad]
-    tilt: float  # largest pitch, at most π/2 [rad]
+    pitch: float  # largest pitch, at most π/2 [rad]
+    tilt: float  # largest angle between the body's z axis and the vertical [rad]
     eps: tuple[tuple[float, float], ...]  # w and the largest Σ|ε_d,k| + w ‖ε_d‖: both are large at few attitudes [1]
     voltages: tuple[float, ...]  # largest |u_k| of each motor present, without error and with θ̂ = 0 [V]
-    rolls: bool  # whether its roll is ever anything but 0
 
 
 def extremes(settings: Settings) -> Extremes:
@@ -79,10 +79,10 @@ def extremes(settings: Settings) -> Extremes:
             jerk=slack * jerk_bound(rate, acceleration, jerk),
             axis_rate=slack * trajectory.largest(lambda at: np.abs(body_rates(at)[0]).max(axis=1), rates),
             half_angle=min(pi / 2, slack * asin(min(1.0, largest_sine))),
-            tilt=min(pi / 2, slack * float(angle[1])),
+            pitch=min(pi / 2, slack * float(angle[1])),
+            tilt=min(pi, slack * trajectory.steepest()),
             eps=tuple((w, slack * weighed(w)) for w in _WEIGHTS),
             voltages=tuple(slack * voltage(row) for row in inverse),
-            rolls=bool(angle[0]),
         )
     if not isfinite(found.rate + found.acceleration + found.half_angle + found.jerk):
         raise BoundlessError("the reference is too fast for floating-point numbers: nothing can be certified")

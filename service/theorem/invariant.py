@@ -35,6 +35,8 @@ class Reach:
     eps_e: float = 0.0  # largest ‖ε̃‖ [1]
     omega_e: float = 0.0  # largest ‖ω_e‖ [rad/s]
     axis_rate: float = 0.0  # largest |ω_k| [rad/s]
+    rate_error: float = 0.0  # largest ‖ω‖ by which the rate received errs [rad/s]
+    estimate_rate: float = 0.0  # largest ‖θ̂'‖ [N·m·s/rad per s]
     half_angle: float = 0.0  # half the body's largest angle [rad]
     slow: float = 0.0  # largest ‖w_s‖ [N·m]
     fast: float = 0.0  # largest torque of age, friction, wind and θ̃ on the error's rate [N·m]
@@ -51,8 +53,15 @@ class Reach:
 
 def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
-    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * (p.delta_omega + p.plant.encoder.ripple)
-    return Reach(axis_rate=p.desired.axis_rate, half_angle=p.desired.half_angle, noise=torque, deviation=torque)
+    rate_error = p.delta_omega + p.plant.encoder.ripple
+    torque = p.delta_q(0.0) * max(p.law.kp) + max(p.law.kd) * rate_error
+    return Reach(
+        axis_rate=p.desired.axis_rate,
+        rate_error=rate_error,
+        half_angle=p.desired.half_angle,
+        noise=torque,
+        deviation=torque,
+    )
 
 
 def reach(p: Premises, start: float = 0.0) -> Reach | None:
@@ -100,7 +109,7 @@ def _slow_torque(p: Premises, eps_e: float) -> tuple[float, float, float, float]
         return inf, inf, inf, inf
     push, pitch, roll = p.law.theta_error * p.desired.axis_rate + p.plant.steady, 0.0, 0.0
     if p.plant.held_roll:
-        pitch = p.desired.tilt + 2 * asin(eps_e)
+        pitch = p.desired.pitch + 2 * asin(eps_e)
         roll = p.law.estimate * p.desired.rate + max(p.J) * p.desired.acceleration + p.weight_roll
         push += sin(pitch) * roll
     return push / cos(pitch) ** 2 if pitch < pi / 2 else inf, push, roll, pitch
@@ -155,12 +164,16 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
 
     late = plant.lag > 0 or encoder.bandwidth > 0  # then the linear equations have θ̂(t₀)
     # A command is old: its feedback by the age, the rest of it by the rotors' lag, too.
-    errs = delta_omega + filtered + encoder.ripple
-    theta_dot = max(law.Gamma) * (axis_omega + errs) * (z2 + errs + delta_R * rate_d + share * delta_q)
-    if theta_dot and not law.virtual:  # the norm of the ball's projection
-        theta_dot *= sqrt(max(law.Gamma) / min(law.Gamma))
+    rate_error = delta_omega + filtered + encoder.ripple
+    z2_error = rate_error + delta_R * rate_d + share * delta_q
+    estimate_at, estimate_at_error = axis_omega, rate_error  # the rate that multiplies θ̂: ω
+    if law.virtual:  # ω_r = R ω_d − c ε̃
+        estimate_at = p.desired.axis_rate + turned + share * eps_e
+        estimate_at_error = delta_R * rate_d + share * delta_q
+    # The projection is one in the norm of Γ^(-1/2), and the clip after Euler's step one in the Euclidean norm.
+    theta_dot = max(law.Gamma) * (estimate_at + estimate_at_error) * (z2 + z2_error)
     rest_dot = (
-        (law.reach if late else law.estimate) * omega_dot + theta_dot * axis_omega
+        (law.reach if late else law.estimate) * omega_dot + theta_dot * estimate_at
         + hypot(*law.centre) * accelerated * late
         + p.weight * omega + 2 * spread * omega * omega_dot
         + j * (omega_e_dot * rate_d + omega_e * accelerated)
@@ -182,6 +195,7 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     hold += ki * encoder.angle  # an integral of the encoders' ripple is that angle
     gap = at["gap"] + plant.lag * rest_dot + 2 * noise + hold + steady * encoder.ripple
     gap += 2 * steady * encoder.angle / plant.lag if plant.lag else 0.0
+    gap += 2 * law.coulomb  # θ̂_c's torque may have just changed its sign
     d5 = noise + hold + plant.uneven * gap
     if plant.held_roll:  # README, step 6; of what the motors do about the roll's axis only part acts
         phi, sine, total = cos(pitch) ** 2, sin(pitch), [a + b for a, b in zip(law.kd, law.alpha, strict=True)]
@@ -213,10 +227,21 @@ def _bounds_after(p: Premises, linear: Responses, at: dict[str, float], eps_e: f
     size = linear.z * slow + at["z"]
     D = d1, d2, push_dot, d4 if ki else 0.0, d5, steady * encoder.angle, steady * encoder.ripple
     return Reach(
-        D, radius=sqrt(size**2 + zeta**2 - eps_e**2), eps_e=needed, omega_e=omega_e, axis_rate=axis_omega,
-        half_angle=half_angle, slow=slow, fast=fast, noise=noise, hold=hold, deviation=deviation,
+        D,
+        radius=sqrt(size**2 + zeta**2 - eps_e**2),
+        eps_e=needed,
+        omega_e=omega_e,
+        axis_rate=axis_omega,
+        rate_error=rate_error,
+        estimate_rate=theta_dot,
+        half_angle=half_angle,
+        slow=slow,
+        fast=fast,
+        noise=noise,
+        hold=hold,
+        deviation=deviation,
         integral=ki * at["integral"] + slow,
-    )  # fmt: skip
+    )
 
 
 def _spread(gain: Sequence[float]) -> float:

@@ -10,18 +10,20 @@ every s and with ‖x(t₀)‖ the norm of (ε̃, z₂) there,
 from __future__ import annotations
 
 from functools import lru_cache
-from math import ceil, log2
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeroloop.service.control.reference import Floats
 
-_STEP: Final = 0.1  # first step of e^{As}, in time constants of the fastest mode
-_BLOCK: Final = 256  # steps until the step doubles, so that every mode is sampled finely while it lasts
+Complexes = NDArray[np.complex128]
+
+_STEP: Final = 0.1  # first step of e^{As}, in time constants of the fastest mode; and of an oscillation [rad]
+_BLOCK: Final = 256  # steps until the step may double, so that a mode that decays is sampled finely while it lasts
 _SLACK: Final = 1.002  # by which trapezoids, and what lies between two steps, are rounded up
 _END: Final = 20.0  # time constants of the slowest mode after which e^{As} counts as 0
-_MOST_BLOCKS: Final = 40
+_MOST_BLOCKS: Final = 512
 
 OUTPUTS: Final = {
     "eps": "", "omega": "", "integral": "", "z": "", "feedback": "", "applied": "", "gap": "",
@@ -104,15 +106,11 @@ def responses(axes: tuple[Axis, ...]) -> Responses | None:
         systems = [system(axis) for axis in axes]
     except np.linalg.LinAlgError:
         return None
-    poles = [np.linalg.eigvals(one.A) for one in systems]
-    slowest, fastest = min(-each.real.max() for each in poles), max(np.abs(each).max() for each in poles)
-    if slowest <= 0:
+    steps = _steps(np.concatenate([np.linalg.eigvals(one.A) for one in systems]))
+    if steps is None:
         return None
-    blocks = ceil(log2(1 + _END / slowest * fastest / _STEP / _BLOCK))
-    if blocks > _MOST_BLOCKS:
-        return None
-    s = np.append(0.0, np.cumsum(np.repeat(_STEP / fastest * 2.0 ** np.arange(blocks), _BLOCK)))
-    flows = [_flow(one.A, s) for one in systems]
+    s = np.append(0.0, np.cumsum(np.repeat(steps, _BLOCK)))
+    flows = [_flow(one.A, steps) for one in systems]
     gains = dict[str, Floats]()
     for name, of in OUTPUTS.items():
         rows = [one.outputs[of or name] for one in systems]
@@ -129,19 +127,51 @@ def responses(axes: tuple[Axis, ...]) -> Responses | None:
 
 def _gain(rows: list[Floats], systems: list[System], s: Floats) -> Floats:
     """The gain of outputs h e^{As} at times s, of each axis, from a start and D₁ to D₅. Shape (6,)."""
-    start = max(np.linalg.norm(row @ one.M, 2, axis=(1, 2)).max() for row, one in zip(rows, systems, strict=True))
+    start = max(_norms(row @ one.M).max() for row, one in zip(rows, systems, strict=True))
     forced = [np.linalg.norm(row @ one.E, axis=1) for row, one in zip(rows, systems, strict=True)]
     return np.append(start, np.trapezoid(np.max(forced, axis=0), s, axis=0)) * _SLACK
 
 
-def _flow(A: Floats, s: Floats) -> Floats:
-    """e^{As} at times whose step doubles from block to block. Shape (len(s), n, n)."""
-    step, h = np.identity(len(A)), float(s[1])
+def _norms(matrices: Floats) -> Floats:
+    """The induced norm of each matrix: of a single row its length, which takes no SVD. Shape (n,)."""
+    order = None if matrices.shape[1] == 1 else 2
+    return np.asarray(np.linalg.norm(matrices, order, axis=(1, 2)))
+
+
+def _steps(poles: Complexes) -> Floats | None:
+    """The step of each block of times at which e^{As} is sampled [s]: as the one before, or twice that.
+
+    A step is `_STEP` of an oscillation at the most, as long as that lasts. None if a mode does not decay, or oscillates
+    for too long.
+    """
+    if poles.real.max() >= 0:
+        return None
+    lasts_s = _END / -poles.real
+    step = _STEP / float(np.abs(poles).max())
+    reached_s = 0.0
+    steps: list[float] = []
+    while reached_s < lasts_s.max():
+        if len(steps) == _MOST_BLOCKS:
+            return None
+        steps.append(step)
+        reached_s += _BLOCK * step
+        fastest_oscillation = float(np.abs(poles.imag[lasts_s > reached_s]).max(initial=0.0))
+        if 2 * step * fastest_oscillation <= _STEP:
+            step *= 2
+    return np.array(steps)
+
+
+def _flow(A: Floats, steps: Floats) -> Floats:
+    """e^{As} at 0 and at the times of blocks of `steps`. Shape (1 + _BLOCK len(steps), n, n)."""
+    h = float(steps[0])
+    step = np.identity(len(A))
     for k in range(16, 0, -1):  # Taylor: ‖A h‖ is of the size of `_STEP`
         step = np.identity(len(A)) + A * h / k @ step
     flow = [np.identity(len(A))]
-    while len(flow) < len(s):
+    for block_h in steps.tolist():
+        if block_h > h:
+            step = step @ step
+            h = block_h
         for _ in range(_BLOCK):
             flow.append(step @ flow[-1])
-        step = step @ step
     return np.array(flow)

@@ -262,7 +262,7 @@ class Premises:
     @property
     def phi(self) -> float:
         """φ: the mean share of a yaw torque that the motors produce along the reference [1]."""
-        return (1 + cos(self.desired.tilt) ** 2) / 2 if self.plant.held_roll else 1.0
+        return (1 + cos(self.desired.pitch) ** 2) / 2 if self.plant.held_roll else 1.0
 
 
 def premises(

@@ -174,6 +174,18 @@ def test_points_of_a_csv_file_are_the_reference_and_stand_in_the_description(tmp
         load(toml)
 
 
+def test_points_without_an_interpolation_are_monotone_and_of_an_older_role_as_it_joined_them() -> None:
+    given = load(overrides=["reference.kind=points", "reference.times=[0, 1]", "reference.attitudes=[[0,0,0],[0,1,2]]"])
+    assert isinstance(given.reference, Points)
+    assert given.reference.interpolation == "monotone"
+    described = given.description()
+    assert from_description(described) == given
+    del described["reference"]["interpolation"]
+    older = from_description(described).reference
+    assert isinstance(older, Points)
+    assert older.interpolation == "differences"
+
+
 @settings(max_examples=100)
 @given(chance=st.randoms(use_true_random=False))
 def test_a_mutated_configuration_is_loaded_or_refused_in_one_line(

@@ -2,7 +2,8 @@
 
 It takes numbers from a configuration and the reference from the twin, and nothing else of the project: body (C.1),
 (C.2), free or with a held roll; the paper's law (C.37), PD and PID as one sum; projection (C.38); rotors that lag;
-commands that are held, late or lost.
+commands that are held, late or lost; a plant that trips beyond its limits of tilt and rate, and by its watchdog, and
+then has 0 V for good.
 
 At every tick the adversary takes the vertex of (C.13) of ε, ω and u, the direction of τ_d and one of the commands that
 may be in force: each the one that pushes most along a costate of the linear error equations. Beside these it chooses θ,
@@ -27,7 +28,7 @@ from tests.support.numpy_twin import attitude_of, motion_of
 
 Array = npt.NDArray[np.float64]
 Motion = tuple[Array, ...]  # q_d, and ω_d and its derivative in the desired body frame
-QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|")
+QUANTITIES: Final = ("‖z‖", "‖ε̃‖", "‖ω_e‖", "|ω_k|", "|ε_k|", "|u_k|", "tilt", "‖ω‖", "ticks without a command")
 VERTICAL: Final = np.array([0.0, 0.0, 1.0])
 END_S: Final = 100 * 86_400.0
 _AT_ONCE: Final = 1e-3  # lag of rotors in the costates of a body without any [s]
@@ -50,7 +51,8 @@ def constants(settings: Any, late: int = 0, *, loss: bool = False, disturbance: 
         "delta_omega": [wire.rate.quantizer().bound],
         "push": [disturbance + hypot(*plant.friction.coulomb)],
         "up": [plant.rotor.lag_up_s], "down": [plant.rotor.lag_down_s], "held": [held],
-        "late": [late], "loss": [loss],
+        "late": [late], "loss": [loss], "watchdog": [round(plant.watchdog_s / settings.loop.period)],
+        "max_tilt": [np.radians(plant.limits.max_tilt_deg)], "max_rate": [plant.limits.max_rate],
         "amplitude": np.radians(settings.reference.amplitude), "frequency": settings.reference.frequency,
     }  # fmt: skip
 
@@ -209,14 +211,15 @@ def run(
 ) -> tuple[Array, Array]:
     """All experiments, until the reference's time `end`, with `target` over (ε̃, ω_e) to be as large as can be then.
 
-    Returns the largest of each of QUANTITIES, shape (rows, 6), and the target that ‖z‖ would have where it was largest.
+    Returns the largest of each of QUANTITIES, shape (rows, 9), and the target that ‖z‖ would have where it was largest.
     """
     rows, p = np.arange(len(end)), costates(c, target, ticks)
     wide = SimpleNamespace(**{name: each[:, None] for name, each in vars(c).items()})
     alone = np.concatenate([np.zeros((1, 6)), np.identity(6)])[None]
     x = in_balance(c, desired(c, end - ticks * c.T[:, 0]), theta, theta_hat, start)
-    commands, in_force, lost_before = [x.V] * (int(c.late.max()) + 1), 0 * rows, 0 * rows
-    best, where = np.zeros((len(rows), 6)), np.zeros((len(rows), 6))
+    commands, in_force, lost_before = [x.V] * (int(c.late.max()) + 1), 0 * rows - 1, 0 * rows
+    silent, tripped = 0 * rows, np.zeros(len(rows), dtype=bool)
+    best, where = np.zeros((len(rows), len(QUANTITIES))), np.zeros((len(rows), 6))
     for i in range(ticks):
         now, costate = desired(c, end - (ticks - i) * c.T[:, 0]), p[i + 1]
         eta_e, eps_e, omega_e, *_ = errors(x.q, x.omega, now)
@@ -248,12 +251,18 @@ def run(
         ages = np.arange(len(commands))[::-1, None]
         allowed = (ages <= (c.late * (1 - c.loss))[:, 0]) & ((i - ages >= in_force) | (ages == 0))
         chosen = np.where(allowed, (np.array(commands) * per_volt).sum(axis=2), -np.inf).argmax(axis=0)
+        silent = np.where((i - ages[chosen, 0] > in_force) & ~lost, 0, silent + 1)
         in_force = i - ages[chosen, 0]
+        tilt = np.arccos(np.clip(1 - 2 * (x.q[:, 1:3] ** 2).sum(axis=1), -1, 1))
+        speed = norm(x.omega)
+        tripped |= (silent >= c.watchdog[:, 0]) | (tilt > c.max_tilt[:, 0]) | (speed > c.max_rate[:, 0])
+        applied = np.where(tripped[:, None], 0, np.array(commands)[chosen, rows])
+        omega_max, eps_max = np.abs(x.omega).max(1), np.abs(x.q[:, 1:]).max(1)
         x = x._replace(theta=theta_hat, integral=integral)
-        x = advance(c, x, np.array(commands)[chosen, rows], theta, c.push * unit(costate[1] / c.J))
+        x = advance(c, x, applied, theta, c.push * unit(costate[1] / c.J))
 
         z = np.sqrt((1 - eta_e[:, 0]) ** 2 + norm(eps_e) ** 2 + norm(z2) ** 2)
-        most = [norm(omega_e), np.abs(x.omega).max(1), np.abs(x.q[:, 1:]).max(1), np.abs(u).max(1)]
+        most = [norm(omega_e), omega_max, eps_max, np.abs(u).max(1), tilt, speed, silent]
         where = np.where((z > best[:, 0])[:, None], np.concatenate([eps_e + c.share * z2, z2], axis=1), where)
         best = np.maximum(best, np.stack([z, norm(eps_e), *most], axis=1))
     return best, where
@@ -262,7 +271,7 @@ def run(
 def worst(known: list[dict[str, Any]], rows: int, generations: int, ticks: int) -> Array:
     """The largest of each of QUANTITIES that the adversary reaches in each configuration, of these `constants`.
 
-    Beside the constants, `start` is the largest ‖x(t₀)‖ and `case` the configuration's number. Shape (cases, 6).
+    Beside the constants, `start` is the largest ‖x(t₀)‖ and `case` the configuration's number. Shape (cases, 9).
     """
     rng, cases, total = np.random.default_rng(1), len(known), len(known) * rows
     c = rows_of(known, rows)

@@ -94,6 +94,7 @@ OTHER = load(
         "loop.rate_hz=250",
         "reference.amplitude=[400.0, 30.0, 400.0]",
         "reference.frequency=[0.1, 0.13, 0.08]",
+        "controller.max_reference_rate=2",
         *(f"plant.rigid_body.{value}" for value in BODY),
         *(f"law.{value}" for value in BODY),
     ],

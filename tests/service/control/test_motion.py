@@ -227,6 +227,88 @@ def test_points_are_passed_each_at_its_time_and_the_last_is_held(
     assert not np.any(followed.at(start + points.times[-1] + 1.0)[1:])
 
 
+def way_through(points: Points, samples: int = 401) -> Angles:
+    """The angles [rad] of each piece between two points. Shapes (pieces, samples, 3)."""
+    trajectory = Trajectory.of(points)
+    lengths = np.append(np.diff(trajectory.starts), 0.0)
+    way = trajectory.at(lengths[:, None] * np.linspace(0, 1, samples))
+    return Angles(*(part[:-1] for part in way))
+
+
+def turns_back(points: Points) -> float:
+    """How far a Bernstein coefficient of a piece's rate has the other sign than its way, as a share of |way|/length.
+
+    The coefficients of the quartic Σ aₙuⁿ are bᵢ = Σₙ C(i, n)/C(4, n) aₙ.
+    """
+    trajectory = Trajectory.of(points)
+    lengths = np.diff(trajectory.starts)
+    ways = np.diff(np.radians(points.attitudes), axis=0)
+    worst = 0.0
+    for length, way, quintic in zip(lengths, ways, trajectory.quintic, strict=False):
+        rate = np.array([(n + 1) * quintic[n + 1] * length**n for n in range(5)])
+        for i in range(5):
+            coefficient = sum(math.comb(i, n) / math.comb(4, n) * rate[n] for n in range(i + 1))
+            scale = np.maximum(np.abs(way), 1e-9) / length
+            worst = max(worst, float((-np.sign(way) * coefficient / scale).max()))
+    return worst
+
+
+def beyond(points: Points) -> float:
+    """How far any angle leaves the range of the two points between which it is [rad]; negative if it does not."""
+    angles = np.radians(points.attitudes)[:, None]
+    between = way_through(points).angle
+    low, high = np.minimum(angles[:-1], angles[1:]), np.maximum(angles[:-1], angles[1:])
+    return float(np.maximum(between - high, low - between).max())
+
+
+OVERSHOOTS: Final = Points(times=[0, 4, 50], attitudes=[(0, 0, 0), (0, 20, 60), (0, 20, 60)])
+
+
+def test_points_after_a_rise_hold_what_they_say_and_the_former_way_is_still_there_for_logs() -> None:
+    assert beyond(OVERSHOOTS) <= 1e-15
+    assert np.array_equal(way_through(OVERSHOOTS).angle[1, :, 1:], np.radians([[20.0, 60.0]] * 401))
+    former = OVERSHOOTS.model_copy(update={"interpolation": "differences"})
+    assert np.degrees(way_through(former).angle.max(axis=(0, 1))) == pytest.approx([0, 99.3, 298.0], abs=0.1)
+
+
+def test_between_two_points_no_angle_leaves_their_range_however_uneven_their_times() -> None:
+    """Gaps from a millisecond to a minute, steps from a microdegree to a turn, up and down or only up."""
+    rng = np.random.default_rng(1)
+    for number in range(400):
+        gaps = 10 ** rng.uniform(-3, 2, rng.integers(1, 9))
+        steps = rng.choice([0, 1, 1, 1], (len(gaps) + 1, 3)) * 10 ** rng.uniform(-6, 2, (len(gaps) + 1, 3))
+        signs = rng.choice([-1, 1], steps.shape if number % 2 else (1, 3))
+        attitudes = np.cumsum(steps * signs, axis=0)
+        times = [0.0, *np.cumsum(gaps).tolist()]
+        points = Points(times=times, attitudes=[(r, p, y) for r, p, y in attitudes.tolist()])
+        assert beyond(points) <= 1e-13 * (1 + np.abs(attitudes).max())
+        assert turns_back(points) <= 1e-6  # of a way that may be 10⁻⁸ of the angles
+        way = way_through(points)
+        for part in way:  # nothing jumps at a point
+            scale = np.abs(part).max(initial=1e-300)
+            assert part[:-1, -1] == pytest.approx(part[1:, 0], abs=1e-9 * scale)
+
+
+def test_points_on_a_line_are_passed_at_its_rate_and_a_dense_curve_is_followed() -> None:
+    line = Points(times=list(range(9)), attitudes=[(0, 5 * n, -10 * n) for n in range(9)])
+    way = way_through(line)
+    assert np.degrees(way.rate[2:-2]) == pytest.approx(np.broadcast_to([0, 5, -10], way.rate[2:-2].shape))
+    assert np.abs(way.acceleration[2:-2]).max() < 1e-12
+
+    t = np.arange(0, 40.05, 0.1)
+    yaw = 50 * (1 - np.cos(0.05 * pi * t))
+    way = way_through(Points(times=t.tolist(), attitudes=[(0, 0, float(angle)) for angle in yaw]))
+    at = t[:-1, None] + 0.1 * np.linspace(0, 1, 401)
+    inner = slice(1, -1)  # it begins and ends at rest without an acceleration
+    rate, acceleration = np.degrees(way.rate[inner, :, 2]), np.degrees(way.acceleration[inner, :, 2])
+    curve_rate = 50 * 0.05 * pi * np.sin(0.05 * pi * at[inner])
+    curve_acceleration = 50 * (0.05 * pi) ** 2 * np.cos(0.05 * pi * at[inner])
+    turns = np.abs(np.sin(0.05 * pi * at[inner])) < 0.1  # where it turns back, a point is passed at rest
+    assert np.abs(rate - curve_rate)[~turns].max() < 2e-3
+    assert np.abs(acceleration - curve_acceleration)[~turns].max() < 0.02
+    assert np.abs(rate - curve_rate).max() < 0.1
+
+
 @settings(max_examples=40)
 @given(
     first=references,

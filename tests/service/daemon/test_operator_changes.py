@@ -428,7 +428,8 @@ def test_points_go_on_with_the_first_that_was_not_reached(
     gaps: list[int], since: int, followed: int, within: int
 ) -> None:
     times = [t / 1000 for t in accumulate(gaps, initial=0)]
-    points = Points(times=times, attitudes=[(0.0, 0.0, float(i)) for i in range(len(times))])
+    attitudes = [(0.0, 0.0, float(i)) for i in range(len(times))]
+    points = Points(times=times, attitudes=attitudes, interpolation="differences")
     ended = {"since_tick": since, "ended_tick": since + followed, "within_s": float(within)}
     left = rest_of_reference(record(points).model_copy(update=ended), PERIOD)
     ahead = [i for i, t in enumerate(times) if t >= followed * PERIOD - within]
@@ -437,6 +438,7 @@ def test_points_go_on_with_the_first_that_was_not_reached(
     else:
         assert isinstance(left, Points)
         assert left.attitudes == points.attitudes[ahead[0] :]
+        assert left.interpolation == points.interpolation
         assert left.times == pytest.approx([times[i] - times[ahead[0]] for i in ahead])
 
 

@@ -14,6 +14,7 @@ from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.spec import Kind, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service import examples
+from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import ConfigError, Settings, bits_overrides, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
@@ -171,6 +172,25 @@ every_kind = pytest.mark.parametrize("kind", get_args(Kind))
 def throughout(kind: str, *more: str) -> Settings:
     """The paper's experiment in lockstep with this kind for all signals."""
     return load_over(lockstep(), [*(f"wire.{signal}.kind={kind}" for signal in SIGNALS), *more])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "names"),
+    [
+        (("reference.amplitude=[0, 61, 0]",), "controller.max_reference_tilt_deg = 60"),
+        (("reference.frequency=[0, 2, 2]",), "controller.max_reference_rate = 1"),
+        (("reference.amplitude=[5, 20, 0]", "reference.frequency=[0.1, 0.1, 0]"), "set its roll to 0"),
+    ],
+)
+def test_a_reference_that_a_controller_would_refuse_is_refused_in_one_line(
+    overrides: tuple[str, ...], names: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = [word for override in overrides for word in ("--set", override)]
+    assert run(("lab", "experiment", "--duration", "0.1", *words)) == 1
+    said = capfd.readouterr().err
+    assert said.startswith("aeroloop: ")
+    assert names in said
+    assert said.count("\n") == 1
 
 
 @every_kind

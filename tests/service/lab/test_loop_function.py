@@ -63,7 +63,7 @@ def configured(chosen: dict[str, Any]) -> Settings:
     tree = {"wire": chosen["wire"], "plant": plant, "loop": {"rate_hz": chosen["rate_hz"]}}
     if "kind" in plant:
         tree |= {"law": LAW, "wire": {**chosen["wire"], "actuators": 3}}
-    tree["reference"] = chosen["reference"]
+    tree |= {"reference": chosen["reference"], "controller": {"max_reference_rate": 100}}
     return load(overrides=as_overrides(tree))
 
 

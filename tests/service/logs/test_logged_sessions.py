@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import SessionRecord
-from aeroloop.protocol.messages.operator import Change, Gains, Hold, Stream, in_force
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Stream, in_force
 from aeroloop.protocol.messages.trace import (
     RECORD_S,
     ControllerRow,
@@ -169,6 +169,40 @@ def test_a_log_of_another_version_is_refused_with_what_to_do(tmp_path: Path) -> 
     both = rewrite(tmp_path / "a.mcap", tmp_path / "c.mcap", metadata=[other_description()])
     assert review(both).z_track == review(tmp_path / "a.mcap").z_track
     assert "protocol version 1" in review(both).damages[0]
+
+
+def test_a_log_from_before_points_named_their_interpolation_replays_as_it_was_followed(tmp_path: Path) -> None:
+    """Points in the configuration and in an operator's change, of which the log has the times and attitudes alone."""
+    attitudes = [(0.0, 0.0, 0.0), (0.0, 4.0, 6.0), (0.0, 4.0, 6.0)]
+    points = Points(times=[0.0, 0.3, 5.0], attitudes=attitudes, interpolation="differences")
+    settings = lockstep().model_copy(update={"reference": points})
+    steeper = points.model_copy(update={"times": [0.0, 0.2, 3.0]})
+
+    def older(interpolation: str) -> Path:
+        """A log of a controller that joins points like that, without the key."""
+        named = {"interpolation": interpolation}
+        configured = settings.model_copy(update={"reference": points.model_copy(update=named)})
+        changes: Changes = {300: (None, steeper.model_copy(update=named))}
+        make_log(tmp_path / "new.mcap", 600, settings=configured, changes=changes)
+        assert not replay([tmp_path / "new.mcap"]).differs
+        key = f',"interpolation":"{interpolation}"'
+        blank = " " * len(key)  # a batch's header has the length of its text
+        messages, metadata = contents(tmp_path / "new.mcap")
+        blanked = [said._replace(data=said.data.replace(key.encode(), blank.encode())) for said in messages]
+        described = [
+            (name, {"key": entries["key"], "json": entries["json"].replace(key, blank)})  # and no checksum
+            for name, entries in metadata
+            if name == "aeroloop.description"
+        ]
+        assert len(described) == 2
+        old = write_messages(tmp_path / "old.mcap", blanked, described)
+        assert not any(b"interpolation" in said.data for said in contents(old)[0])
+        return old
+
+    replayed = replay([older("differences")])
+    assert replayed.controller is not None
+    assert (replayed.controller.ticks, replayed.controller.differ) == (600, 0)
+    assert replay([older("monotone")]).differs
 
 
 def other_description() -> tuple[str, dict[str, str]]:

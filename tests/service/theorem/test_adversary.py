@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from math import sin
+from math import radians, sin
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -69,7 +69,14 @@ BODY: Final = (
     "law.inertia=[0.02, 0.03, 0.01]", "plant.rigid_body.inertia=[0.02, 0.03, 0.01]",
     "law.centre_of_mass=[0.002, 0.001, -0.0038]", "plant.rigid_body.centre_of_mass=[0.002, 0.001, -0.0038]",
 )  # fmt: skip
-SWUNG: Final = (*FREE, *bits("cont", "cont", "cont"), *swing("60, 50, 80", "0.04, 0.04006, 0.04002"))
+SWUNG: Final = (
+    *FREE, *bits("cont", "cont", "cont"), *swing("60, 50, 80", "0.04, 0.04006, 0.04002"),
+    "controller.max_reference_tilt_deg=90", "plant.limits.max_tilt_deg=90",
+)  # fmt: skip
+PATIENT: Final = (
+    *FREE, *bits(16, 16, 16), *swing("0, 5, 10", "0, 0.1, 0.07"), "law.damping_estimate=[0, 0.006, 0.006]",
+    "law.damping_bound=0.001", *law("pd", "kp=[0.02, 0.02, 0.02]", "kd=[0.05, 0.05, 0.05]"),
+)  # fmt: skip
 CASES: Final = {
     "8/8/6 bits": Case((*FREE, *bits(8, 8, 6), *law("adaptive"))),
     "10/6/6 bits, from afar": Case((*FREE, *bits(10, 6, 6), *law("adaptive")), start=0.3),
@@ -83,6 +90,11 @@ CASES: Final = {
     "real time, pushed": Case((*FREE, *bits(12, 12, 12), "loop.lockstep=false", *law("adaptive")), 1, disturbance=1e-3),
     "Coulomb friction": Case((*FREE, *bits(12, 12, 12), "plant.friction.coulomb=[0.0005, 0.0003]", *law("adaptive"))),
     "nonadaptive, late, from afar": Case((*FREE, *bits(10, 10, 10), *law("nonadaptive")), late=3, start=0.5),
+    "at the limits of tilt and rate": Case(
+        (*FREE, *bits(12, 12, 12), *law("adaptive"), "plant.limits.max_tilt_deg=41.2", "plant.limits.max_rate=0.375")
+    ),
+    "PD, as late as its watchdog allows": Case(PATIENT, late=24),
+    "PD, as many frames lost as its watchdog allows": Case(PATIENT, late=24, loss=True),
     "PD, pushed hard": Case((*FREE, *bits(12, 12, 12), *law("pd")), disturbance=2e-2),
     "PID, late, pushed": Case((*FREE, *bits(10, 10, 10), *law("pid", hz=100)), late=1, disturbance=2e-3),
     "PID, rotors": Case((*FREE, *bits(10, 10, 10), *rotors(0.02, 0.02), *law("pid", hz=100))),
@@ -106,7 +118,10 @@ def shares(rows: int = 24, generations: int = 3, ticks: int = 600) -> dict[str, 
         at = reach(e.plant, start := case.start * e.plant_reach.radius)
         assert at is not None, name
         volts = largest_voltage(settings, e.plant.desired, at)
-        limits.append([at.radius, at.eps_e, at.omega_e, at.axis_rate, sin(at.half_angle), volts])
+        trips = settings.plant.limits
+        most_silent = round(settings.plant.watchdog_s / settings.loop.period) - 1
+        proven = [at.radius, at.eps_e, at.omega_e, at.axis_rate, sin(at.half_angle), volts]
+        limits.append([*proven, radians(trips.max_tilt_deg), trips.max_rate, most_silent])
         numbers = loop.constants(settings, case.late, loss=case.loss, disturbance=case.disturbance)
         known.append(numbers | {"start": [start], "case": [i]})
     return dict(zip(CASES, loop.worst(known, rows, generations, ticks) / np.array(limits), strict=True))
@@ -117,6 +132,26 @@ def test_no_loop_of_an_adversary_exceeds_what_is_proven(name: str) -> None:
     found = shares()[name]
     assert found.max() <= 1
     assert found[0] > LEAST
+
+
+BEYOND: Final = {
+    "the watchdog": (PATIENT, 25),
+    "the largest tilt": ((*PATIENT, "plant.limits.max_tilt_deg=4"), 0),
+    "the largest rate": ((*PATIENT, "plant.limits.max_rate=0.01"), 0),
+}
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_a_loop_beyond_what_its_plant_lets_pass_trips_and_is_not_certified(name: str) -> None:
+    changes, late = BEYOND[name]
+    settings = load_over(Settings(), changes)
+    late_s = late * settings.loop.period
+    numbers = loop.constants(settings, late) | {"start": [0.0], "case": [0]}
+    reached = loop.worst([numbers], 8, 2, 1200)[0]
+    allowed = reach(evaluate(load_over(Settings(), PATIENT), late_s=late_s).plant)
+    assert allowed is not None
+    assert reached[1] > allowed.eps_e
+    assert not certify(settings, late_s=late_s, margins=False).holds
 
 
 def test_the_adversary_comes_near_to_what_is_proven() -> None:

@@ -9,16 +9,19 @@ from math import degrees, hypot, inf, pi, radians, sqrt
 import numpy as np
 import pytest
 
-from aeroloop.protocol.messages.operator import Hold
+from aeroloop.plant_emulator.endpoint.endpoint import Freshness
+from aeroloop.protocol.messages.operator import Hold, Points
+from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.theorem.bounds import Known, lemma_1, theorem_1
-from aeroloop.service.theorem.certificate import RESOLUTION_S, certify, evaluate
+from aeroloop.service.theorem.certificate import RESOLUTION_S, Patience, certify, evaluate, patience_of
 from tests.support.certified import FREE, bits, certified_settings
 from tests.support.ideal import IDEAL
 
 PAPER = Settings()
+TOO_TILTED = ("reference.amplitude=[20, 80, 60]", "reference.frequency=[0.1, 0.05, 0.03]")
 SMALL = ["law.damping_bound=0.0119"]
 
 
@@ -148,6 +151,15 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
         (("plant.rigid_body.allocation=[[0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]",), "torque"),
         (("law.C2=[0.03, 0.03, 0.03]",), "no invariant set"),
         (("law.damping_bound=0.05",), "(law.damping_bound)"),
+        (("plant.limits.max_tilt_deg=25",), "trip: plant.limits.max_tilt_deg = 25"),
+        (("plant.limits.max_tilt_deg=40.9",), "the tilt may reach 41"),  # 40° of the reference, and the set
+        (("plant.limits.max_rate=0.05",), "trip: plant.limits.max_rate = 0.05"),
+        (("plant.limits.max_rate=0.36",), "‖ω‖ may reach 0.369"),
+        (("wire.voltage.limit=2.12", "wire.voltage.bits=6"), "plant.limits.max_saturated_s"),  # as quantized
+        (("controller.max_reference_rate=0.3",), "controller.max_reference_rate"),
+        (("controller.max_reference_tilt_deg=39",), "controller.max_reference_tilt_deg"),
+        (TOO_TILTED, "plant.limits.max_tilt_deg = 75"),
+        (TOO_TILTED, "controller.max_reference_tilt_deg = 60"),
     ],
 )
 def test_everything_that_the_proof_presumes_is_required(change: tuple[str, ...], names: str) -> None:
@@ -208,6 +220,68 @@ def test_of_what_nothing_can_be_certified_one_line_says_why(
 ) -> None:
     assert run(("lab", "certify", "--set", change)) == 1
     assert capfd.readouterr().err.startswith(f"aeroloop: {line}")
+
+
+PATIENT = (
+    "law.kind=pd", "law.kp=[0.02, 0.02, 0.02]", "law.kd=[0.05, 0.05, 0.05]", "law.damping_bound=0.001",
+    "law.damping_estimate=[0, 0.006, 0.006]", "reference.amplitude=[0, 5, 10]",
+)  # fmt: skip
+"""Gains with which the set alone holds for 160 ms of further delay."""
+WAITS_LONG = ("plant.watchdog_s=0.5", "controller.stale_s=0.5", "wire.counter_bits=10")
+ON_CHANGE = ("wire.transmit.command=on_change", "wire.transmit.heartbeat_s=0.02")
+
+
+@pytest.mark.parametrize(
+    ("changes", "margins", "patience"),
+    [
+        ((), (98.0, 49), Patience(0.098, 49, 1)),
+        (("plant.watchdog_s=0.05",), (48.0, 24), Patience(0.048, 24, 1)),
+        (("controller.stale_s=0.05",), (98.0, 24), Patience(0.098, 24, 1)),
+        (("plant.watchdog_s=0.5", "wire.counter_bits=10"), (160.17, 49), Patience(0.498, 49, 1)),
+        (ON_CHANGE, (80.0, 4), Patience(0.08, 4, 10)),
+        # 80 ticks late are 8 heartbeats: a command lost with its frame is repeated by the next one only.
+        ((*ON_CHANGE, *WAITS_LONG), (160.17, 8), Patience(0.48, 24, 10)),
+        ((*ON_CHANGE, "loop.lockstep=true"), (98.0, 49), Patience(0.098, 49, 1)),
+    ],
+)  # fmt: skip
+def test_no_margin_is_claimed_beyond_what_the_ends_wait_for(
+    changes: tuple[str, ...], margins: tuple[float, int], patience: Patience
+) -> None:
+    settings = certified_settings(16, 16, *PATIENT, *changes)
+    assert patience_of(settings) == pytest.approx(patience)
+    found = certify(settings)
+    assert (found.delay_ms, found.lost_frames) == pytest.approx(margins, abs=0.02)
+    assert certify(settings, late_s=0.001 + margins[0] / 1e3, margins=False).violated
+
+
+@pytest.mark.parametrize("watchdog_s", [0.1, 0.05, 0.002, 0.0009])
+def test_the_plants_own_watchdog_lets_pass_just_what_is_claimed(watchdog_s: float) -> None:
+    """`Freshness`, which trips a plant: fresh commands with so many ticks between them that have none."""
+    settings = certified_settings(12, 12, f"plant.watchdog_s={watchdog_s}")
+    period_ns, patience = settings.loop.period_ns, patience_of(settings)
+    assert patience.delay_s == pytest.approx(patience.lost_frames * settings.loop.period)
+
+    def trips(ticks_without: int) -> bool:
+        freshness = Freshness(256, period_ns, watchdog_s)
+        freshness.measured(0)
+        assert freshness.judge(0, 0, 0) is Outcome.ACTED
+        overdue = [freshness.overdue(k * period_ns) for k in range(1, ticks_without + 1)]
+        return any(reason is not None for reason in overdue)
+
+    assert not trips(patience.lost_frames)
+    assert trips(patience.lost_frames + 1)
+
+
+def test_a_reference_of_points_is_certified_as_it_is_followed() -> None:
+    """The paper's body, at rest at 20° and 60° from 4 s on; it used to swing to 99° and 298°."""
+    points = Points(times=[0, 4, 50], attitudes=[(0, 0, 0), (0, 20, 60), (0, 20, 60)])
+    settings = certified_settings().model_copy(update={"reference": points})
+    found = evaluate(settings).plant.desired
+    assert degrees(found.pitch) == pytest.approx(20 * 1.005)
+    assert degrees(found.tilt) == pytest.approx(20 * 1.005)
+    assert certify(settings, margins=False).holds
+    swings = settings.model_copy(update={"reference": points.model_copy(update={"interpolation": "differences"})})
+    assert any("max_reference_tilt_deg" in reason for reason in certify(swings, margins=False).violated)
 
 
 def test_at_the_margins_it_holds_and_just_beyond_it_does_not() -> None:

@@ -23,19 +23,19 @@ LOCKED = Sinusoid(amplitude=(20, 30, 60), frequency=(0.4, 0.3, 0.15))
 
 
 def largest(reference: Sinusoid, angles: Angles) -> Floats:
-    """‖ω_d‖, ‖ω̇_d‖, max |ω_d,k|, half the angle, pitch, Σ|ε_k|, and each motor's voltage, of all these states."""
+    """‖ω_d‖, ‖ω̇_d‖, max |ω_d,k|, half the angle, pitch, Σ|ε_k|, each motor's voltage, and tilt, of all these states."""
     settings = certified_settings().model_copy(update={"reference": reference})
     (omega, omega_dot), eps = body_rates(angles), vectors(angles)
     volts = feedforward(angles, settings.law) @ np.linalg.inv(np.array(settings.law.allocation)).T
     found = [np.linalg.norm(omega, axis=1), np.linalg.norm(omega_dot, axis=1), np.abs(omega).max(axis=1)]
     found += [np.arcsin(np.minimum(1, np.linalg.norm(eps, axis=1))), np.minimum(pi / 2, np.abs(angles.angle[:, 1]))]
-    return np.array([each.max() for each in (*found, np.abs(eps).sum(axis=1), *np.abs(volts).T)])
+    return np.array([each.max() for each in (*found, np.abs(eps).sum(axis=1), *np.abs(volts).T, angles.tilts())])
 
 
 def bounds(reference: Sinusoid) -> Floats:
     """What `extremes` says of the same."""
     e = extremes(certified_settings().model_copy(update={"reference": reference}))
-    return np.array([e.rate, e.acceleration, e.axis_rate, e.half_angle, e.tilt, e.eps[0][1], *e.voltages])
+    return np.array([e.rate, e.acceleration, e.axis_rate, e.half_angle, e.pitch, e.eps[0][1], *e.voltages, e.tilt])
 
 
 RUNS = [(SLOW_ROLL, 0.1, 7_000), (UNEVEN, 0.5, 80_000), (PAPER, 0.001, 40), (LOCKED, 0.005, 126)]
@@ -59,7 +59,7 @@ def test_the_extremes_are_above_those_of_many_phases_and_near_the_largest(refere
         amplitude = tuple(rng.uniform((0, 0, 0), (80, 89, 300)).tolist())
         frequency = tuple((rng.uniform(0.1, 1, 3) * np.sqrt([1, 2, 3])).tolist())
         reference = Sinusoid(amplitude=amplitude, frequency=frequency)
-    allowed, reached = bounds(reference), np.zeros(9)
+    allowed, reached = bounds(reference), np.zeros(10)
     for _ in range(4):
         phases = rng.uniform(0, 2 * pi, (100_000, 3))
         near = np.round(phases[::2] / (pi / 2)) * pi / 2  # many extremes are near these

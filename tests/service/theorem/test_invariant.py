@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import pi, sqrt, tanh
+from pathlib import Path
+from typing import Final
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.service.config import Settings, load_over
+from aeroloop.service import examples
+from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.interface import ExpressionLaw, Now
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.reference import Angles, Floats, Trajectory
 from aeroloop.service.theorem.bounds import coordinates, rotation, times
+from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
 from aeroloop.service.theorem.invariant import distance, reach
 from aeroloop.service.theorem.linear import Axis, responses, system
 from aeroloop.service.theorem.premises import PlantBounds, Premises, premises
 from tests.support.adversary_loop import times as product
+from tests.support.certified import certified_settings
+from tests.support.ideal import IDEAL
 
 SMALL = "law.damping_bound=0.0119"
 UNEQUAL = {
@@ -170,6 +177,65 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(kind: str,
     assert np.all(reached >= 0.15 * np.array(allowed))
 
 
+STIFF = (
+    "law.kind=adaptive-torque", "law.C1=[15, 15, 15]", "law.C2=[0.05, 0.05, 0.05]", "law.k1=[0.1, 0.1, 0.1]",
+    "law.damping_bound=0.0005", "law.coulomb_bound=1e-5", "law.Gamma_torque=[0, 0, 0]", "reference.kind=hold",
+    "reference.attitude=[0, 0, 0]", "law.voltage_limit=1e6",
+)  # fmt: skip
+"""A law that learns at the virtual rate ω_r = Rω_d − C₁ε̃, which is much larger than ω at a held attitude."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "pinned"),
+    [(STIFF, 2.4817e-4), (("law.Gamma=[0.2, 0.02, 0.05]",), 5.5338e-4)],
+    ids=["virtual rate", "unequal Γ"],
+)
+def test_no_estimate_within_the_set_moves_faster_than_is_counted(changes: tuple[str, ...], pinned: float) -> None:
+    """θ̂' of the law itself, at errors on the set's edge that point where the law learns most.
+
+    With unequal Γ θ̂ is outside its inner ball, so that the projection acts.
+    """
+    settings = settings_of(16, *changes)
+    virtual = changes == STIFF
+    p = of(settings)
+    p = replace(p, plant=replace(p.plant, torque=0.005 if virtual else 0.0))
+    at = reach(p)
+    assert at is not None
+    rng, n = np.random.default_rng(6), 20_000
+    t = rng.uniform(0, 40, n)
+    planned = Angles(*(part[0] for part in Trajectory.of(settings.reference).at(t[None])))
+    eps_e = balls(rng, at.eps_e, n)
+    omega_e = balls(rng, at.omega_e, n)
+    aimed = rng.random(n) < 0.5
+    axis = np.identity(3)[rng.integers(0, 3, n)]
+    eps_e[aimed] = (at.eps_e * axis)[aimed]
+    omega_e[aimed] = (at.omega_e * axis)[aimed]
+    q = product(with_scalar(vectors(planned)), with_scalar(eps_e))
+    theta_hat = np.array(p.law.centre) + balls(rng, p.law.reach, n)
+    state = {"sign": np.ones((n, 1)), "damping_estimate": theta_hat}
+    if virtual:
+        theta_hat = np.array(p.law.centre) + p.law.radius * rng.uniform(0, 0.9, (n, 3))  # within the box
+        still = np.zeros((n, 3))
+        state |= {"damping_estimate": theta_hat, "torque_estimate": still, "coulomb_estimate": still}
+    *_, wanted = errors_of(settings, p, t, q, omega_e, theta_hat, theta_hat)
+    omega = omega_e + times(np.swapaxes(rotation(q), 1, 2), wanted["desired_rate"])
+    _, after = commanded(settings, {"attitude": q, "rate": omega, **wanted}, state)
+    moved = np.linalg.norm(after["damping_estimate"] - theta_hat, axis=1) / settings.loop.period
+    assert moved.max() <= at.estimate_rate
+    assert moved.max() > 0.5 * at.estimate_rate
+    assert at.estimate_rate == pytest.approx(pinned, rel=1e-3)  # with the errors of what is received
+
+
+def test_rotors_that_differ_up_and_down_err_by_twice_an_estimate_of_coulomb_friction_that_switches() -> None:
+    """The torque that lags behind is −θ̂_c where θ̂_c is commanded."""
+    p = of(settings_of(16, *STIFF, "law.C1=[2, 2, 2]", "law.C2=[0.2, 0.2, 0.2]"))
+    uneven = replace(p, plant=replace(p.plant, lag=0.02, uneven=0.1))
+    more = replace(uneven, law=uneven.law._replace(coulomb=uneven.law.coulomb + 1e-3))
+    errors = [at.D[4] for at in (reach(uneven), reach(more)) if at is not None]
+    assert len(errors) == 2
+    assert errors[1] - errors[0] >= 0.1 * 2 * 1e-3
+
+
 PLAIN = Axis(
     kp=1.045, kd=0.15, alpha=0.003, ki=0, share=0.3, damping=0.02, J=0.02, phi=1, lag=0, bandwidth=0, ratio=0
 )  # fmt: skip
@@ -200,6 +266,64 @@ def test_the_gains_are_the_largest_answers_to_bounded_inputs(name: str) -> None:
     slope = np.abs(one.outputs["omega"] @ one.A @ impulse).sum(axis=0) * step + np.abs(one.outputs["omega"] @ one.E)
     assert slope[0] == pytest.approx(found.gains["omega_dot"][1:6], rel=2e-2, abs=1e-3)
     assert pytest.approx(-one.E[:, 1] * axis.phi) == one.A @ one.K
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.1, 0.01, 0.0025])
+def test_an_oscillation_that_hardly_decays_is_sampled_finely_as_long_as_it_lasts(ratio: float) -> None:
+    """∫|h e^{As}E| in closed form: ∫ e^{−σs}|sin ωs| ds = ω/(σ² + ω²) · coth(πσ/2ω)."""
+    natural = sqrt(PLAIN.kp / 2 / PLAIN.J)
+    axis = PLAIN._replace(kd=2 * ratio * natural * PLAIN.J, alpha=0.0, damping=0.0)
+    found = responses((axis,))
+    assert found is not None
+    sigma, omega = ratio * natural, natural * sqrt(1 - ratio**2)
+    exact = 1 / (2 * PLAIN.J) / natural**2 / tanh(pi * sigma / (2 * omega))  # of ε̃, by a torque
+    assert exact <= found.gains["eps"][2] <= 1.0025 * exact
+
+
+def test_of_a_loop_that_hardly_decays_nothing_is_proven() -> None:
+    assert responses((PLAIN._replace(kd=1e-6, alpha=0.0, damping=0.0),)) is None
+
+
+HELD: Final = (
+    *IDEAL, "law.damping_bound=0.0135", *(f"wire.{name}.bits=12" for name in ("attitude", "rate", "voltage")),
+    "loop.lockstep=true", "reference.frequency=[0, 0.1, 0.07]",
+)  # fmt: skip
+ENCODED: Final = load_over(Settings(), [
+    *HELD, "reference.amplitude=[0, 5, 20]", "plant.sensors.attitude=perfect", "plant.sensors.rate=derivative",
+    "plant.sensors.counts=[65536, 65536]", "plant.sensors.bandwidth=500",
+])  # fmt: skip
+BENCH: Final = load(Path(examples.__path__[0]) / "aero-certified.toml")
+PINNED: Final = {
+    "in real time": (certified_settings(12, 12), 0.02434),
+    "in lockstep": (certified_settings(12, 12, "loop.lockstep=true"), 0.02337),
+    "unequal Γ": (certified_settings(12, 12, "law.Gamma=[0.2, 0.02, 0.05]"), 0.02533),
+    "unequal C₁, C₂": (certified_settings(12, 12, "law.C1=[0.3, 1.0, 0.5]", "law.C2=[0.3, 0.15, 0.25]"), 0.03103),
+    "a held roll": (load_over(Settings(), [*HELD, "reference.amplitude=[0, 10, 60]"]), 0.01483),
+    "a rate by encoders": (ENCODED, 0.01983),
+    "rotors that differ up and down": (BENCH, 0.1725),
+}
+
+
+@pytest.mark.parametrize("name", PINNED)
+def test_the_plants_radius_is_what_it_was_and_never_smaller_by_a_slip(name: str) -> None:
+    """Each is loose, so that a line of the proof that is lost would beat no test here; so the numbers are pinned."""
+    settings, radius = PINNED[name]
+    found = certify(settings, margins=False)
+    assert found.holds
+    assert found.plant_radius == pytest.approx(radius, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "allowed", "refused"),
+    [
+        (ENCODED, "plant.limits.max_rate=0.078", "plant.limits.max_rate=0.076"),  # 0.045, and 0.032 by the rate's error
+        (BENCH, "plant.limits.max_tilt_deg=7.5", "plant.limits.max_tilt_deg=7.3"),  # 7.2°, and 0.2° by the encoders
+    ],
+    ids=["rate", "tilt"],
+)
+def test_a_plant_trips_by_what_its_sensors_measure(settings: Settings, allowed: str, refused: str) -> None:
+    assert certify(load_over(settings, [allowed]), margins=False).holds
+    assert not certify(load_over(settings, [refused]), margins=False).holds
 
 
 def test_a_start_farther_away_reaches_farther_until_nothing_is_proven() -> None:

@@ -147,7 +147,7 @@ BODY = (
     "plant.rigid_body.damping=[0.0, 0.0070, 0.0095]",
     "plant.rigid_body.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]",
     "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "reference.amplitude=[300, 40, 300]",
-    "reference.frequency=[0.1, 0.13, 0.08]",
+    "reference.frequency=[0.1, 0.13, 0.08]", "controller.max_reference_tilt_deg=180", "controller.max_reference_rate=2",
 )  # fmt: skip
 
 
