@@ -21,6 +21,7 @@ from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
@@ -34,29 +35,36 @@ class Relay(VehicleClaim):
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
         super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.number = 0
+        self._ticks = self._tick_counter()
         self._silent_measurements = lockstep and wire.transmit.measurement == "on_change"
         self._judged = Outcome.NONE  # of the last command since the last tick
 
-    def measurement(self, frame: bytes) -> bytes | None:
-        """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick.
+    def measurement(self, frame: bytes, at_ns: int) -> bytes | None:
+        """Take a frame that the bus delivered at `at_ns` on the monotonic clock [ns].
 
-        A session begins with counter 0; frames before it are of another session.
+        Returns it if it is to be forwarded, which makes a tick. A session begins with counter 0; frames before it are
+        of another session. A frame that repeats the last one, or that a newer one has overtaken, is no tick; the rule
+        is that of the controller's own counter.
         """
         if self.session is None:
             return None
         begun = self.session_tick >= 0
         if frame == UNCHANGED and self._silent_measurements:
-            ticks = int(begun)
-        elif (read := self.wire.measurement.unpack(frame)) is None:
-            self.refused += 1
-            return None
+            if not begun:
+                return None
+            self._ticks.tick += 1
         else:
-            ticks = (read[0] - self.counter - 1) % self._counters + 1 if begun else int(read[0] == 0)
-        if not ticks:
-            return None
+            counter = self.wire.measurement.counter(frame)
+            if counter is None:
+                self.refused += 1
+                return None
+            if not begun and counter != 0:
+                return None
+            if self._ticks.advance(counter, at_ns) is None:
+                return None
         if not begun:
             self._freshness.measured(None)  # the wait for the first command begins with the next `watch`
-        self._count(ticks)
+        self._count(self._ticks.tick - self.session_tick)
         return frame
 
     def command(self, frame: bytes, now_ns: int) -> bytes | None:
@@ -78,6 +86,9 @@ class Relay(VehicleClaim):
         self._trip(TripCause.COMMAND_TIMEOUT, reason)
         return True
 
+    def _tick_counter(self) -> TickCounter:
+        return TickCounter(self.period_ns, self._counters, lockstep=self.lockstep)
+
     def _count(self, ticks: int) -> None:
         self.ticked += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
@@ -85,6 +96,7 @@ class Relay(VehicleClaim):
     def _begin(self) -> None:
         super()._begin()
         self.number = (self.number + 1) % SESSIONS
+        self._ticks = self._tick_counter()
         self._judged = Outcome.NONE
 
 
@@ -142,7 +154,7 @@ class Bridge:
         measured, link = self._bus.take(), self._network.link
         if link is None:
             return
-        if measured is not None and self._relay.measurement(measured.frame) is not None:
+        if measured is not None and self._relay.measurement(measured.frame, measured.at_ns) is not None:
             sent_ns = time.monotonic_ns()
             link.send(measured.frame)
             self._network.sent += measured.frame != UNCHANGED

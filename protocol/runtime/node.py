@@ -37,6 +37,8 @@ LONG_S: Final = 10.0  # least time between two requests of a topic that take lon
 ASKER_LENGTH: Final = 100  # most characters of an operator's name
 ASKED_BY: Final = ContextVar("asked by", default="")
 """The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
+GHOST_S: Final = 3.0  # how long the token of a plant that does not answer has to disappear
+GHOST_POLL_S: Final = 0.1
 _RECENT_S: Final = 10.0
 _SELDOM_PER_S: Final = 8.0  # cached messages of a topic that was not declared beforehand: statuses, events
 _GRAVE: Final = ("tripped", "lost", "fault", "refused")
@@ -291,18 +293,40 @@ class Node:
 
 
 def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
+    """Raise NetworkError if a plant of this vehicle is on the network.
+
+    On a busy machine the others may still have the token of a plant that has just ended: their links to it end later
+    than its process. So a token whose plant does not answer gets `GHOST_S` to disappear.
+    """
     with command_session(network, identity=Identity(("plant",), vehicle), patient=True) as here:
         here.wait_for_links()
-        if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=COMMAND_S)):
+        deadline = time.monotonic() + GHOST_S
+        process = None
+        while _has_token(here.session, vehicle):
+            process = _process_of_plant(here.session, vehicle)
+            if process is not None or time.monotonic() > deadline:
+                break
+            time.sleep(GHOST_POLL_S)
+        else:
             return
-        where = ""
-        for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
-            with suppress(MessageError):
-                where = (
-                    f" ({Status.decode(reply.ok.payload.to_bytes(), extra='ignore').process})" if reply.ok else where
-                )
+    answer = f"({process})" if process else "(which does not answer: it may be halted)"
     remedy = "stop that one, or give this one a name of its own with --set vehicle=NAME"
-    raise NetworkError(f"{vehicle} has a plant already{where}; {remedy}")
+    raise NetworkError(f"{vehicle} has a plant already {answer}; {remedy}")
+
+
+def _has_token(session: zenoh.Session, vehicle: str) -> bool:
+    """Whether anyone on the network knows of a plant of this vehicle."""
+    replies = session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=COMMAND_S)
+    return any(reply.ok is not None for reply in replies)
+
+
+def _process_of_plant(session: zenoh.Session, vehicle: str) -> str | None:
+    """Host and pid of a vehicle's plant, by its status; None if it does not answer."""
+    for reply in session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
+        if reply.ok is not None:
+            with suppress(MessageError):
+                return Status.decode(reply.ok.payload.to_bytes(), extra="ignore").process
+    return None
 
 
 class RecorderWatch:

@@ -31,6 +31,7 @@ CLASSIC_BYTES: Final = 8
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 HEARTBEAT_S: Final = 0.1
 SILENT_S: Final = 0.5  # a peer from which nothing is received for this long, five heartbeats, is gone [s]
+LOCKSTEP_SILENT_S: Final = 10.0  # the same in lockstep, where a busy machine may hold up a heartbeat for long [s]
 
 _STATES: Final = list(PlantState)
 _CAUSES: Final = list(TripCause)

@@ -17,6 +17,7 @@ from aeroloop.protocol.transport.can_format import (
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
     HEARTBEAT_S,
+    LOCKSTEP_SILENT_S,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     SILENT_S,
@@ -64,6 +65,7 @@ class CanLink(Link):
         self._settings = settings
         self._size = getattr(wire, received).size
         self._may_be_silent = len(UNCHANGED) in wire.lengths(received, lockstep=lockstep)
+        self._patience_s = LOCKSTEP_SILENT_S if lockstep else SILENT_S
         self._reopen_due = self._beat_due = 0.0
         self._sent: Heartbeat | None = None  # the last heartbeat sent
         self._open = False
@@ -93,8 +95,8 @@ class CanLink(Link):
 
     @property
     def silent(self) -> bool:
-        """Whether the other end has been silent for longer than `SILENT_S`."""
-        return self.silent_s() > SILENT_S
+        """Whether the other end has been silent for longer than `SILENT_S`, in lockstep than `LOCKSTEP_SILENT_S`."""
+        return self.silent_s() > self._patience_s
 
     def reopen(self) -> bool:
         """Reopen the bus after a fault, twice a second at the most; whether that succeeded."""

@@ -103,6 +103,12 @@ def can_node(config: Config = None, overrides: Overrides = None) -> None:
     settings = load_settings(config, overrides)
 
     def run(stop: Event) -> None:
+        from aeroloop.plant_emulator.hosts.bench_lock import can_bench
+
+        with can_bench(settings.can, "plant"):
+            run_node(stop)
+
+    def run_node(stop: Event) -> None:
         if settings.can.node_in_c:
             from aeroloop.service.firmware import node
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Final
 
+from aeroloop.plant_emulator.hosts.bench_lock import can_bench, quanser_bench
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.config import Settings
@@ -20,10 +22,12 @@ def run_plant(role: Node, settings: Settings) -> None:
     if plant.via == "can":
         from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 
-        Bridge(role, loop, wire, plant, settings.can).run()
-    else:
-        from aeroloop.plant_emulator.hosts import zenoh_network
+        with can_bench(settings.can, "controller"):
+            Bridge(role, loop, wire, plant, settings.can).run()
+        return
+    from aeroloop.plant_emulator.hosts import zenoh_network
 
+    with quanser_bench(plant.quanser) if plant.via == "quanser" else nullcontext():
         zenoh_network.run_plant(role, loop, wire, plant)
 
 

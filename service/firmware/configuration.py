@@ -7,7 +7,7 @@ from math import isinf
 
 from aeroloop.plant_emulator.endpoint.endpoint import Freshness
 from aeroloop.plant_emulator.endpoint.limits import LimitMonitor
-from aeroloop.protocol.transport.can_format import HEARTBEAT_S, SILENT_S, carried_bytes, fingerprint
+from aeroloop.protocol.transport.can_format import HEARTBEAT_S, LOCKSTEP_SILENT_S, SILENT_S, carried_bytes, fingerprint
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import CodedQuantizer, LogarithmicQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec
@@ -62,7 +62,7 @@ def config_header(settings: Settings) -> str:
         ("CAN_NODE", can.node, "number of the plant on the bus"),
         ("CAN_FD", int(can.fd), "CAN FD, which frames of more than 8 bytes need"),
         ("CAN_HEARTBEAT_NS", round(HEARTBEAT_S * 1e9), "from heartbeat to heartbeat [ns]"),
-        ("CAN_SILENT_NS", round(SILENT_S * 1e9), "a peer that is silent for longer is gone [ns]"),
+        ("CAN_SILENT_NS", round((LOCKSTEP_SILENT_S if loop.lockstep else SILENT_S) * 1e9), "a peer that is silent for longer is gone [ns]"),
         ("FINGERPRINT", f"{{{identity}}}", "of wire, period and lockstep"),
     ]
     lines = [

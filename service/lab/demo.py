@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Self
 
 from pydantic import Field
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.transport.can_format import SILENT_S
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.recording.rolling import log_path, parts
@@ -20,6 +22,7 @@ from aeroloop.service.review.review import read
 from aeroloop.service.testing.process_group import ProcessGroup, standalone
 
 REFRESH_S = 0.1
+POLL_S = 0.01
 CLAIM_WAIT_S = 60.0
 """The controller claims the plant within a second here; a machine may stall."""
 
@@ -61,7 +64,7 @@ def run_demo(
     show = show or (lambda *_: None)
     with ProcessGroup(settings) as processes, _on_interrupt(interrupted):
         show("three processes", processes)
-        processes.start_loop()
+        processes.start_loop(own_node=settings.plant.via == "can" and not node_is_on_the_bus(settings))
 
         def begun() -> bool:
             show("the first command", processes)
@@ -80,6 +83,17 @@ def run_demo(
         if interrupted.is_set():
             raise KeyboardInterrupt from None  # before there was anything to review
         raise
+
+
+def node_is_on_the_bus(settings: Settings) -> bool:
+    """Whether the node of `[can]` is on its bus, by its heartbeats; waits for `SILENT_S`. Raises CanError."""
+    from aeroloop.protocol.transport.can_link import CanLink
+
+    with closing(CanLink(settings.can, settings.wire, "controller")) as bus:
+        deadline = time.monotonic() + SILENT_S
+        while bus.peer is None and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        return bus.peer is not None
 
 
 @contextmanager

@@ -105,7 +105,7 @@ class Hil:
         self._requested_ticks = 0
         self._processes = ProcessGroup(loaded, log.with_suffix(""))
         self._logs.append(HilLog(log))
-        self.processes.start_loop(drive=drive)
+        self.processes.start_loop(drive=drive, own_node=self._private_bus)
         if drive:
             self.eventually("the controller drives the plant", self._closed)
 

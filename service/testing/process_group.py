@@ -194,13 +194,20 @@ class ProcessGroup:
             self.zenoh.close()
             self._cleanup.close()
 
-    def start_loop(self, *, drive: bool = True, environment: Mapping[str, str] | None = None) -> None:
-        """Start recorder, plant end, a node on a bus that is software, and to drive it a controller.
+    def start_loop(
+        self, *, drive: bool = True, own_node: bool = False, environment: Mapping[str, str] | None = None
+    ) -> None:
+        """Start recorder, plant end, an emulated node on the CAN bus if it is to have one, and to drive it a controller.
 
-        Waits for recorder and plant; `environment` is as of `start_command`.
+        Waits for recorder and plant.
+
+        Args:
+            drive: Whether to start a controller.
+            own_node: Whether to start a `can-node`. Never where a real node may be on the bus.
+            environment: Environment variables of the processes, instead of a fork with this process's imports.
         """
         roles: list[RoleName] = ["recorder", "plant"]
-        if self.settings.plant.via == "can" and self.settings.can.interface == "udp_multicast":
+        if own_node:
             roles.insert(1, "can-node")
         if drive:
             roles.append("controller")

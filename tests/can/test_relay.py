@@ -37,7 +37,7 @@ def granted(wire: WireSpec = WIRE, *, lockstep: bool = False) -> Relay:
 def driven(wire: WireSpec = WIRE, *, lockstep: bool = False) -> Relay:
     """A relay whose first command, of echo 0, came at NOW."""
     it = granted(wire, lockstep=lockstep)
-    assert it.measurement(measurement(0)) is not None
+    assert it.measurement(measurement(0), NOW) is not None
     assert it.command(command(0), NOW) is not None
     assert it.state is PlantState.DRIVEN
     return it
@@ -53,13 +53,27 @@ def test_what_is_well_formed_passes_untouched_in_a_session_and_only_there(
     counter: int, codes: list[int], voltages: list[int]
 ) -> None:
     it, there, back = granted(), measurement(counter, codes), WIRE.command.pack(counter, voltages)
-    assert it.measurement(measurement(0)) == measurement(0)
-    assert it.measurement(there) == there
+    later = NOW + (counter or COUNTERS) * PERIOD_NS
+    assert it.measurement(measurement(0), NOW) == measurement(0)
+    assert it.measurement(there, later) == there
     assert it.counter == counter
-    assert it.command(back, NOW) == back  # stale or not: the node judges it again
+    assert it.command(back, later) == back  # stale or not: the node judges it again
     it.release("of-a")
-    assert it.measurement(there) is it.command(back, NOW) is None
+    assert it.measurement(there, later) is it.command(back, later) is None
     assert it.refused == 0
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_repeated_or_overtaken_measurement_is_no_tick(lockstep: bool) -> None:
+    it = granted(lockstep=lockstep)
+    for k in range(6):
+        assert it.measurement(measurement(k), NOW + k * PERIOD_NS) is not None
+    just_after = NOW + 5 * PERIOD_NS + 1
+    assert it.measurement(measurement(5), just_after) is None
+    assert it.measurement(measurement(3), just_after) is None
+    assert it.session_tick == 5
+    assert it.measurement(measurement(8), NOW + 8 * PERIOD_NS) is not None  # frames 6 and 7 were lost
+    assert it.session_tick == 8
 
 
 def test_the_first_measurement_has_a_second_and_owes_nothing_to_the_time_of_the_last_session() -> None:
@@ -101,11 +115,11 @@ def test_while_it_is_unavailable_claims_are_refused_and_clear_no_latch() -> None
 
 def test_silence_passes_in_lockstep_after_a_sessions_first_frame_and_has_the_counter_after_the_last() -> None:
     it = granted(BOTH, lockstep=True)
-    assert it.measurement(UNCHANGED) is it.command(UNCHANGED, NOW) is None
+    assert it.measurement(UNCHANGED, NOW) is it.command(UNCHANGED, NOW) is None
     assert (it.session_tick, it.refused) == (-1, 1)  # the command was no first one
-    assert it.measurement(measurement(0)) is not None
+    assert it.measurement(measurement(0), NOW) is not None
     for k in range(1, 15):
-        assert it.measurement(UNCHANGED) == UNCHANGED
+        assert it.measurement(UNCHANGED, NOW) == UNCHANGED
         assert it.counter == k
     assert it.command(command(0), NOW) is not None
     assert it.command(UNCHANGED, NOW) == UNCHANGED
@@ -115,6 +129,6 @@ def test_silence_passes_in_lockstep_after_a_sessions_first_frame_and_has_the_cou
 @pytest.mark.parametrize(("wire", "lockstep"), [(BOTH, False), (WIRE, True)])
 def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpec, lockstep: bool) -> None:
     it = driven(wire, lockstep=lockstep)
-    assert it.measurement(UNCHANGED) is it.command(UNCHANGED, NOW + WATCHDOG_NS - 1) is None
+    assert it.measurement(UNCHANGED, NOW) is it.command(UNCHANGED, NOW + WATCHDOG_NS - 1) is None
     assert it.refused == 2
     assert it.watch(NOW + WATCHDOG_NS) == (not lockstep)

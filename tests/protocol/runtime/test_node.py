@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 
+import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
+from aeroloop.protocol.transport.network_settings import NetworkError
 from tests.support.operated_loop import LEVEL as AT_REST
 from tests.support.operated_loop import Loop, Query
 from tests.support.zenoh_network import Gathering, eventually
@@ -104,6 +106,22 @@ def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_t
     while loop.role.take_inbox():
         pass
     assert len(acted) == WAITING
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_the_token_of_a_plant_that_does_not_answer_keeps_another_out_only_while_it_lasts(ends: bool) -> None:
+    """A busy peer may still have the token of a plant that has ended. A halted plant's token stays."""
+    with Gathering() as gathering:
+        ghost = gathering.join()
+        token = ghost.liveliness().declare_token("aeroloop/aero/alive/plant")
+        # The first query for its status shows that the newcomer has seen the token.
+        ghost.declare_queryable("aeroloop/aero/status/plant", lambda _: token.undeclare() if ends else None)
+        if ends:
+            with Node("plant", "aero", gathering.settings, {}) as role:
+                assert role.role == "plant"
+        else:
+            with pytest.raises(NetworkError, match="has a plant already .which does not answer"):
+                Node("plant", "aero", gathering.settings, {})
 
 
 def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:
