@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
+from hashlib import sha256
 from math import isinf
 
 from aeroloop.plant_emulator.endpoint.endpoint import Freshness
@@ -64,6 +66,7 @@ def config_header(settings: Settings) -> str:
         ("CAN_HEARTBEAT_NS", round(HEARTBEAT_S * 1e9), "from heartbeat to heartbeat [ns]"),
         ("CAN_SILENT_NS", round((LOCKSTEP_SILENT_S if loop.lockstep else SILENT_S) * 1e9), "a peer that is silent for longer is gone [ns]"),
         ("FINGERPRINT", f"{{{identity}}}", "of wire, period and lockstep"),
+        ("CONFIG", config_number(settings), "of all settings: what is linked together has the same"),
     ]
     lines = [
         *(f"#define AERO_{name} {value} /* {comment} */" for name, value, comment in defined),
@@ -74,6 +77,17 @@ def config_header(settings: Settings) -> str:
         *_quantizer("VOLTAGE", wire.voltage, "V"),
     ]
     return header("aero_config", lines)
+
+
+def settings_digest(settings: Settings) -> str:
+    """SHA-256 of the effective configuration, in hexadecimal digits."""
+    text = json.dumps(settings.description(), sort_keys=True)
+    return sha256(text.encode()).hexdigest()
+
+
+def config_number(settings: Settings) -> str:
+    """First 64 bits of `settings_digest`, as C's literal."""
+    return f"0x{settings_digest(settings)[:16]}U"
 
 
 def header(name: str, lines: Sequence[str]) -> str:

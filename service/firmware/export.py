@@ -28,7 +28,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import configured_gains, initial_state, law_function, law_of
 from aeroloop.service.control.reference import Trajectory, reference_function
-from aeroloop.service.firmware.configuration import config_header, exact, header
+from aeroloop.service.firmware.configuration import config_header, config_number, exact, header, settings_digest
 from aeroloop.service.firmware.script import ScriptedController
 from aeroloop.service.lab.experiment import LoopEndedError, experiment
 from aeroloop.service.theorem.certificate import promise
@@ -92,16 +92,19 @@ def equations_files(settings: Settings) -> dict[str, str]:
     """`aero_names.h` and `aero_equations.c`, by name. Raises as `expression_law`."""
     law = expression_law(settings)
     function = equations(law)
-    return {"aero_names.h": _names_header(settings, law, function), f"{_EQUATIONS}.c": c_source(function)}
+    config = f"\n#include <stdint.h>\n\nconst uint64_t {_EQUATIONS}_config = {config_number(settings)};\n"
+    source = c_source(function) + config
+    return {"aero_names.h": _names_header(settings, law, function), f"{_EQUATIONS}.c": source}
 
 
 def c_source(*functions: ca.Function) -> str:
-    """Functions as C."""
+    """Functions as C, which compiles where `aero_float.h` allows it."""
     generator = ca.CodeGenerator("functions.c", {"casadi_int": "long long int"})
     for function in functions:
         generator.add(function)
     with TemporaryDirectory(prefix="aeroloop-") as folder:
-        return Path(generator.generate(f"{folder}/")).read_text(encoding="ascii")
+        generated = Path(generator.generate(f"{folder}/")).read_text(encoding="ascii")
+    return f'#include "aero_float.h"\n{generated}'
 
 
 def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Function) -> str:
@@ -116,6 +119,11 @@ def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Func
         )
     )
     lines = [
+        '#include "aero_config.h"',
+        f"#if AERO_CONFIG != {config_number(settings)}",
+        '#error "aero_config.h is of another export: copy all of its files"',
+        "#endif",
+        "",
         f"/* Names of the law {_ascii(settings.law.kind)}, its configured gains and the configured reference. */",
         *_struct("aero_state", state, {name: f"[{unit}]" for name, unit in units.items()}),
         f"#define AERO_STATE_BYTES {8 * sum(map(len, state.values()))}U",
@@ -128,7 +136,8 @@ def _names_header(settings: Settings, law: ExpressionLaw[Any], function: ca.Func
         f"#define AERO_PERIOD_S {settings.loop.period.hex()} /* {settings.loop.period:.9g} s */",
         f"#define AERO_REFERENCE {{{pieces}}}",
         "",
-        "/* Reference and law: aero_equations.c. Lengths of its arrays. */",
+        "/* Reference and law: aero_equations.c, the AERO_CONFIG that it was generated for, lengths of its arrays. */",
+        "extern const uint64_t aero_equations_config;",
         "int aero_equations(const double **arguments, double **results, long long int *indices, double *scratch, int);",
         f"#define AERO_SCRATCH_ARGUMENTS {function.sz_arg()}",
         f"#define AERO_SCRATCH_RESULTS {function.sz_res()}",
@@ -178,15 +187,13 @@ def _golden_header(controller: ScriptedController) -> str:
 
 def _version_header(settings: Settings) -> str:
     known = versions()
-    digests = {
-        "WIRE": json.dumps(settings.wire.agreed(), sort_keys=True),
-        "CONFIGURATION": json.dumps(settings.description(), sort_keys=True),
-    }
+    wire = json.dumps(settings.wire.agreed(), sort_keys=True)
     texts = {
         "VERSION": known["aeroloop"],
         "REVISION": known.get("revision", ""),
         "CASADI": known["casadi"],
-        **{f"{name}_SHA256": sha256(text.encode()).hexdigest() for name, text in digests.items()},
+        "WIRE_SHA256": sha256(wire.encode()).hexdigest(),
+        "CONFIGURATION_SHA256": settings_digest(settings),
         "CERTIFICATE": promise(settings).verdict,
     }
     lines = [f'#define AERO_{name} "{_ascii(text)}"' for name, text in texts.items()]

@@ -44,6 +44,8 @@ MACHINES: Final[dict[str, Machine]] = {
     ),
 }
 """Processors by name. A Cortex-M4F has double precision in software only."""
+EXACT: Final = ("-ffp-contract=off", "-fno-tree-slp-vectorize")
+"""Compiler's flags that keep every rounding; the Makefile has them, too."""
 _BARE: Final = ("--specs=rdimon.specs", "-Tcortex_m.ld", "cortex_m.c")  # to link a program for no system
 
 
@@ -52,7 +54,7 @@ def compiled(sources: Sequence[Path], out: Path, *flags: str) -> Path:
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise ExportError("this needs a C compiler: cc, gcc or clang")
-    words = [compiler, "-std=c99", "-O1", "-ffp-contract=off", *flags, *map(str, sources), "-o", str(out), "-lm"]
+    words = [compiler, "-std=c99", "-O1", *EXACT, *flags, *map(str, sources), "-o", str(out), "-lm"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # ours
     if done.returncode:
         raise ExportError(f"{out.name} does not compile: {(done.stderr.splitlines() or ['no message'])[0]}")

@@ -29,7 +29,7 @@ def build(settings: Settings, folder: Path) -> Path:
         ExportError: The plant has what the C lacks: faults, wind or noise; or there is no compiler, or it fails.
     """
     check_widths(settings.can, settings.wire)
-    for name in ("aero_wire", "aero_node", "aero_port", "linux/aero_linux"):
+    for name in ("aero_float", "aero_wire", "aero_node", "aero_port", "linux/aero_linux"):
         for source in SOURCES.glob(f"{name}.[ch]"):
             shutil.copy(source, folder)
     (folder / "aero_config.h").write_text(config_header(settings), encoding="ascii")

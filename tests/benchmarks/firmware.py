@@ -20,7 +20,7 @@ import numpy as np
 
 from aeroloop.service.config import Settings, load
 from aeroloop.service.firmware.export import equations, export, expression_law
-from aeroloop.service.firmware.machines import MACHINES, Program
+from aeroloop.service.firmware.machines import EXACT, MACHINES, Program
 from aeroloop.service.firmware.script import ScriptedController, answers_in
 from aeroloop.service.lab.experiment import experiment
 from aeroloop.service.theorem.certificate import certify
@@ -45,6 +45,8 @@ int __wrap_aero_law_tick(aero_law *law, const uint8_t *frame, size_t size, int64
 IN_SINGLE: Final = """
 #include <math.h>
 #include <stddef.h>
+#include "aero_wire.h"
+const uint64_t aero_equations_config = AERO_CONFIG;
 int single(const float **, float **, long long int *, float *, int);
 int aero_equations(const double **arguments, double **results, long long int *indices, double *scratch, int memory) {
     static const size_t of_in[] = {%s}, of_out[] = {%s};
@@ -87,7 +89,7 @@ def sizes(folder: Path) -> None:
         flags = [
             "-std=c99",
             "-Os",
-            "-ffp-contract=off",
+            *EXACT,
             "-ffunction-sections",
             "-fdata-sections",
             "-w",
@@ -122,7 +124,7 @@ def instructions(folder: Path) -> float:
     """Instructions of a tick on a Cortex-M4F, the mean of the golden ones."""
     (folder / "counter.c").write_text(COUNTER)
     arm = MACHINES["cortex-m4"]
-    flags = [*arm.flags, "-std=gnu99", "-Os", "-ffp-contract=off", "-w", "-Wl,--wrap=aero_law_tick"]
+    flags = [*arm.flags, "-std=gnu99", "-Os", *EXACT, "-w", "-Wl,--wrap=aero_law_tick"]
     sources = ["counter.c", "test_golden.c", "aero_wire.c", "aero_law.c", "aero_equations.c", "cortex_m.c"]
     link = ["--specs=rdimon.specs", "-Tcortex_m.ld", "-o", "counted", "-lm"]
     subprocess.run([arm.compiler, *flags, *sources, *link], cwd=folder, check=True)

@@ -18,6 +18,7 @@ void aero_law_start(aero_law *law) {
     law->state = initial_state;
     memcpy(law->outputs.attitude, identity, sizeof identity);
     law->tick = -1;
+    law->fault = aero_wire_config != AERO_CONFIG || aero_equations_config != AERO_CONFIG;
     for (size_t i = 0; i < COUNT(law->voltage_codes); i++) law->voltage_codes[i] = (double)NAN;
     aero_forget(&law->sender);
 }
@@ -28,8 +29,8 @@ static const aero_piece *piece_at(const aero_law *law, double t) {
     return &law->pieces[last];
 }
 
-/* Computes a tick from the levels of a measurement; `next` and `out` are its results. */
-static void compute(const aero_law *law, double t, const double levels[AERO_MEASURED], aero_state *next,
+/* Computes a tick from the levels of a measurement; `next` and `out` are its results, if it returns 1. */
+static int compute(const aero_law *law, double t, const double levels[AERO_MEASURED], aero_state *next,
                     aero_outputs *out) {
     const aero_piece *piece = piece_at(law, t);
     double scratch[AERO_SCRATCH];
@@ -42,8 +43,16 @@ static void compute(const aero_law *law, double t, const double levels[AERO_MEAS
     double *results[AERO_SCRATCH_RESULTS];
     memcpy(arguments, given, sizeof given);
     memcpy(results, found, sizeof found);
-    (void)aero_equations(arguments, results, indices, scratch, 0);
     memcpy(out->rate, levels + 3, sizeof out->rate);
+    return aero_equations(arguments, results, indices, scratch, 0) == 0;
+}
+
+static int has_nan(const aero_state *state) {
+    const double *values = (const double *)state;
+    for (size_t i = 0; i < AERO_STATE_BYTES / sizeof *values; i++) {
+        if (isnan(values[i])) return 1;
+    }
+    return 0;
 }
 
 static int is_number(const double *values, size_t count) {
@@ -72,8 +81,12 @@ static void answer(aero_law *law, int64_t k, const double levels[AERO_MEASURED],
         law->invalid++;
         return;
     }
-    compute(law, (double)k * AERO_PERIOD_S, levels, &next, &out);
-    if (is_number(out.voltages, AERO_ACTUATORS)) {
+    if (law->fault) return;
+    if (!compute(law, (double)k * AERO_PERIOD_S, levels, &next, &out)) {
+        law->fault = 1;
+        return;
+    }
+    if (is_number(out.voltages, AERO_ACTUATORS) && !has_nan(&next)) {
         for (size_t i = 0; i < AERO_ACTUATORS; i++) {
             if (aero_saturates(&aero_voltage, out.voltages[i])) law->saturated++;
             codes[i] = law->voltage_codes[i] = aero_encode(&aero_voltage, out.voltages[i], law->voltage_codes[i]);
@@ -91,7 +104,8 @@ int aero_law_tick(aero_law *law, const uint8_t *frame, size_t size, int64_t k, u
     uint32_t counter = (uint32_t)(k % AERO_COUNTERS);
     double levels[AERO_MEASURED], codes[AERO_ACTUATORS];
     int unchanged = AERO_MEASUREMENT_ON_CHANGE && size == 0 && law->has_held;
-    if (!unchanged && !receive(law, frame, size, &counter)) return AERO_NO_ANSWER;
+    if (k < 0) law->refused++;
+    if (k < 0 || (!unchanged && !receive(law, frame, size, &counter))) return AERO_REFUSED;
     for (size_t i = 0; i < AERO_MEASURED; i++) levels[i] = aero_level(i < 3 ? &aero_attitude : &aero_rate, law->held[i]);
     answer(law, k, levels, codes);
     if (!aero_due(&law->sender, AERO_COMMAND_ON_CHANGE, k, codes, AERO_ACTUATORS)) return AERO_UNCHANGED;

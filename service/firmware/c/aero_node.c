@@ -7,6 +7,8 @@
 #include "aero_port.h"
 
 enum { MEASUREMENT_ID = 0x100, COMMAND_ID = 0x200, PLANT_BEAT_ID = 0x300, CONTROLLER_BEAT_ID = 0x380, CLASSIC = 8 };
+/* Of one poll: no bus carries 40 frames a millisecond, so what a babbling one repeats takes no longer than this. */
+enum { MOST_FRAMES = 64 + AERO_PERIOD_NS / 25000 };
 
 static const uint8_t FINGERPRINT[AERO_HEARTBEAT_BYTES - 1] = AERO_FINGERPRINT;
 static const int SILENT_COMMANDS = AERO_LOCKSTEP && AERO_COMMAND_ON_CHANGE;
@@ -17,6 +19,8 @@ static const int FORGIVEN = AERO_MEASUREMENT_ON_CHANGE && !AERO_LOCKSTEP ? AERO_
 int aero_in_session(const aero_node *n) { return n->state == AERO_GRANTED || n->state == AERO_DRIVEN; }
 
 static int64_t wrapped(int64_t count) { return (count % AERO_COUNTERS + AERO_COUNTERS) % AERO_COUNTERS; }
+
+static int is_one_export(void) { return aero_wire_config == AERO_CONFIG; }
 
 static void actuate(const aero_node *n)
 {
@@ -31,10 +35,12 @@ static void actuate(const aero_node *n)
 
 static void end(aero_node *n, int state)
 {
+    for (int i = 0; i < AERO_ACTUATORS; i++) { n->voltages[i] = 0; }
+    actuate(n);
+    aero_port_enable(0);
     n->state = state;
     n->echo = n->answered = n->since = -1;
     n->has_codes = 0;
-    for (int i = 0; i < AERO_ACTUATORS; i++) { n->voltages[i] = 0; }
 }
 
 static void begin(aero_node *n)
@@ -48,6 +54,7 @@ static void begin(aero_node *n)
     for (int i = 0; i < AERO_MEASURED; i++) { n->held[i] = NAN; }
     memset(n->invalid, 0, sizeof n->invalid);
     aero_forget(&n->sender);
+    aero_port_enable(1);
 }
 
 void aero_trip(aero_node *n, int cause)
@@ -72,6 +79,7 @@ static void beat_when_due(aero_node *n)
 
 static void accept_command(aero_node *n, const uint8_t *data, size_t size)
 {
+    if (size > AERO_CAN_BYTES) { n->refused++; return; }
     int good = size == AERO_COMMAND_BYTES || (size == 0 && SILENT_COMMANDS) ||
                (size > AERO_COMMAND_BYTES && AERO_COMMAND_BYTES > CLASSIC);
     for (size_t i = AERO_COMMAND_BYTES; i < size; i++) { good = good && data[i] == 0; }
@@ -88,7 +96,7 @@ static void accept_beat(aero_node *n, const uint8_t *data, size_t size)
     n->has_peer = 1;
     n->peer_state = data[0] & 0x0F;
     n->peer_number = data[0] >> 4;
-    n->peer_is_ours = memcmp(data + 1, FINGERPRINT, sizeof FINGERPRINT) == 0;
+    n->peer_is_ours = is_one_export() && memcmp(data + 1, FINGERPRINT, sizeof FINGERPRINT) == 0;
     n->peer_ns = aero_port_now();
 }
 
@@ -97,7 +105,7 @@ void aero_poll(aero_node *n)
     uint8_t data[AERO_CAN_BYTES];
     uint32_t id;
     size_t size;
-    while (aero_port_receive(&id, data, &size)) {
+    for (int i = 0; i < MOST_FRAMES && aero_port_receive(&id, data, &size); i++) {
         if (id == COMMAND_ID + AERO_CAN_NODE) { accept_command(n, data, size); }
         if (id == CONTROLLER_BEAT_ID + AERO_CAN_NODE) { accept_beat(n, data, size); }
     }
@@ -168,7 +176,7 @@ static void measure(aero_node *n, int64_t k)
     aero_port_measure(n->ticked, q, w);
     int valid = isfinite(q[0] + q[1] + q[2] + q[3] + w[0] + w[1] + w[2]) != 0;
     int cause = beyond_limits(n, q, w, valid);
-    if (cause) { aero_trip(n, cause); actuate(n); return; }
+    if (cause) { aero_trip(n, cause); return; }
     int64_t counter = wrapped(n->ticked - n->start);
     for (int i = 0; i < AERO_MEASURED; i++) {
         const aero_quantizer *signal = i < 3 ? &aero_attitude : &aero_rate;
@@ -186,15 +194,25 @@ static void measure(aero_node *n, int64_t k)
     }
 }
 
+/* The periods up to tick k pass, at 0 V from the tick on at which the next command is overdue. */
+static void advance_to(aero_node *n, int64_t k)
+{
+    if (n->since < 0 || k - n->since <= n->patience) { actuate(n); }
+    else {
+        int64_t overdue = n->since + n->patience;
+        if (n->ticked < overdue) { actuate(n); n->ticked = overdue; }
+        aero_trip(n, AERO_COMMAND_TIMEOUT);
+    }
+    n->ticked = k;
+}
+
 void aero_tick(aero_node *n, int64_t k)
 {
+    if (k <= n->ticked) { aero_trip(n, AERO_NODE); beat_when_due(n); return; }
     if (n->ticked < 0) { n->ticked = 0; }
     else if (n->has_command && aero_in_session(n)) { apply(n); }
     if (aero_in_session(n)) { n->has_command = 0; }
-    for (; n->ticked < k; n->ticked++) {
-        if (n->since >= 0 && n->ticked - n->since >= n->patience) { aero_trip(n, AERO_COMMAND_TIMEOUT); }
-        actuate(n);
-    }
+    advance_to(n, k);
     if (aero_in_session(n)) { measure(n, k); }
     beat_when_due(n);
 }
@@ -214,12 +232,12 @@ void aero_start(aero_node *n)
 {
     memset(n, 0, sizeof *n);
     n->ticked = n->number = -1;
-    end(n, AERO_IDLE);
+    if (!is_one_export()) { n->cause = AERO_NODE; }
+    end(n, is_one_export() ? AERO_IDLE : AERO_TRIPPED);
 }
 
 void aero_leave(aero_node *n)
 {
-    if (aero_in_session(n)) { end(n, AERO_IDLE); }
-    actuate(n);
+    end(n, aero_in_session(n) ? AERO_IDLE : n->state);
     beat_when_due(n);
 }

@@ -1,7 +1,11 @@
 /* Node: the plant end on a CAN bus, with watchdog, limits and latch; SPEC.md, sections 6 and 9.
  *
  * It keeps no clock: time is the tick index, and the port's clock is for heartbeats and a silent peer alone. Outside a
- * session, after a trip and at first the motors are at 0 V. A board calls, at each tick k: aero_poll, aero_tick(k). */
+ * session, after a trip and at first the motors are at 0 V, and their power stage is off. A board calls, at each tick k:
+ * aero_poll, aero_tick(k).
+ *
+ * One context: these functions share `node` without a lock, and call the port's. So call them from one task or one
+ * interrupt, and from nowhere that can interrupt it, nor from the port's functions. */
 #ifndef AERO_NODE_H
 #define AERO_NODE_H
 
@@ -37,9 +41,17 @@ typedef struct {
 } aero_node;
 
 int aero_in_session(const aero_node *node);     /* granted or driven */
-void aero_start(aero_node *node);               /* idle, at 0 V, before tick 0 */
-void aero_poll(aero_node *node);                /* take what was received, follow the controller's heartbeat */
-void aero_tick(aero_node *node, int64_t k);     /* command, watchdog, voltages, measurement up to tick k, which rises */
+
+/* Idle, at 0 V, before tick 0. Linked with an aero_wire.c of another export it stays tripped, as AERO_NODE. */
+void aero_start(aero_node *node);
+
+/* Take what was received, as much as a bus carries in a period, and follow the controller's heartbeat. */
+void aero_poll(aero_node *node);
+
+/* Command, watchdog, voltages, measurement at tick k. k rises from 0 on, by any number: the skipped ticks are over, and
+ * the watchdog counts them. A k that does not rise is a failure of the board, and trips: the watchdog would stand still. */
+void aero_tick(aero_node *node, int64_t k);
+
 int aero_answered(aero_node *node);             /* lockstep: whether the answer to the last measurement waits */
 void aero_trip(aero_node *node, int cause);     /* end the session for a cause that the board detects, at 0 V */
 void aero_leave(aero_node *node);               /* release, at 0 V */

@@ -7,6 +7,7 @@
 #define SLACK 0x1p-50 /* a value this near to an edge, as a part of it, lies on the edge */
 #define TIE (1.0 - SLACK)
 
+const uint64_t aero_wire_config = AERO_CONFIG;
 const aero_quantizer aero_attitude = AERO_ATTITUDE, aero_rate = AERO_RATE, aero_voltage = AERO_VOLTAGE;
 
 /* -- quantizers -- */

@@ -1,14 +1,19 @@
 /* Wire: quantizers, frames and transmit policy; SPEC.md, sections 2 and 3. No heap, no I/O, no global that changes.
  *
- * Bit for bit what aeroloop's Python computes where `double` is IEEE 754 binary64: compile with -ffp-contract=off and
- * without -ffast-math. */
+ * Bit for bit what aeroloop's Python computes, where aero_float.h lets it compile. */
 #ifndef AERO_WIRE_H
 #define AERO_WIRE_H
+
+#include "aero_float.h"
 
 #include <stddef.h>
 #include <stdint.h>
 
 #include "aero_config.h"
+
+/* AERO_CONFIG of aero_wire.c. Node and law compare it with their own when they start: object files of two exports in
+ * one program would misread each other's frames. */
+extern const uint64_t aero_wire_config;
 
 enum { AERO_CONTINUOUS, AERO_UNIFORM, AERO_HYSTERESIS, AERO_LOGARITHMIC };
 enum { AERO_MEASURED = 6, AERO_MAX_CODES = 8 }; /* codes of a measurement: e1 e2 e3 w1 w2 w3; of any frame at most */

@@ -11,6 +11,7 @@ import pytest
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.firmware.configuration import config_header
+from aeroloop.service.firmware.machines import EXACT
 from tests.support.firmware import COMPILERS, SOURCE
 
 NEEDED = ("arm-none-eabi-gcc", "qemu-arm")
@@ -34,6 +35,7 @@ static void note(const void *at, size_t size)
 }
 int64_t aero_port_now(void) { return now; }
 void aero_port_actuate(int64_t k, const double v[AERO_ACTUATORS]) { note(&k, sizeof k); note(v, sizeof node.voltages); }
+void aero_port_enable(int on) { note(&on, sizeof on); }
 void aero_port_measure(int64_t k, double a[4], double r[3]) { (void)k; memcpy(a, q, sizeof q); memcpy(r, w, sizeof w); }
 void aero_port_send(uint32_t to, const uint8_t *bytes, size_t size)
 {
@@ -106,7 +108,7 @@ def test_quantizers_and_node_give_the_same_bits_on_arm_as_here(floats: str, tmp_
     digests = []
     for compiler, flags, runner in ((COMPILERS[0], ["-O1"], []), (NEEDED[0], arm, [NEEDED[1]])):
         program = tmp_path / compiler
-        words = ["-std=c99", "-ffp-contract=off", f"-I{tmp_path}", f"-I{SOURCE}", "-o", str(program), "main.c"]
+        words = ["-std=c99", *EXACT, f"-I{tmp_path}", f"-I{SOURCE}", "-o", str(program), "main.c"]
         sources = [str(SOURCE / f"aero_{part}.c") for part in ("wire", "node")]
         subprocess.run([compiler, *flags, *words, *sources, "-lm"], cwd=tmp_path, check=True)
         done = subprocess.run([*runner, str(program)], capture_output=True, text=True, check=True)

@@ -24,6 +24,7 @@
 
 static const int64_t SECOND_NS = 1000000000, ANSWER_TIMEOUT_NS = 2000000000; /* in lockstep the watchdog stands still */
 static const int IDLE_WAIT_MS = 20;
+static const int MOST_REFUSED = 64; /* of a call: what comes after so many that are no frames waits for the next */
 
 static volatile sig_atomic_t stopped;
 static int bus, on_udp;
@@ -44,6 +45,8 @@ void aero_port_actuate(int64_t k, const double voltages[AERO_ACTUATORS])
     advance_to(k);
     memcpy(plant.voltages, voltages, sizeof plant.voltages);
 }
+
+void aero_port_enable(int on) { (void)on; } /* the emulated plant has no power stage */
 
 void aero_port_measure(int64_t k, double q[4], double w[3])
 {
@@ -132,11 +135,15 @@ int aero_port_receive(uint32_t *id, uint8_t data[64], size_t *size)
     uint8_t datagram[4096];
     struct canfd_frame frame;
     ssize_t got;
-    while (on_udp && (got = recv(bus, datagram, sizeof datagram, MSG_DONTWAIT)) >= 0) {
+    for (int i = 0; on_udp && i < MOST_REFUSED; i++) {
+        got = recv(bus, datagram, sizeof datagram, MSG_DONTWAIT);
+        if (got < 0) { return 0; }
         if (read_datagram(datagram, (size_t)got, id, data, size)) { return 1; }
     }
-    while (!on_udp && (got = recv(bus, &frame, sizeof frame, MSG_DONTWAIT)) >= (ssize_t)CAN_MTU) {
-        if (frame.can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG)) { continue; }
+    for (int i = 0; !on_udp && i < MOST_REFUSED; i++) {
+        got = recv(bus, &frame, sizeof frame, MSG_DONTWAIT);
+        if (got < (ssize_t)CAN_MTU) { return 0; }
+        if (frame.can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG) || frame.len > CANFD_MAX_DLEN) { continue; }
         *id = frame.can_id;
         memcpy(data, frame.data, *size = frame.len);
         return 1;
@@ -165,6 +172,7 @@ static void run_in_real_time(aero_node *node)
         int64_t due = start + k * AERO_PERIOD_NS;
         struct timespec until = {.tv_sec = due / SECOND_NS, .tv_nsec = due % SECOND_NS};
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR && !stopped) { }
+        if (stopped) { return; }
         wait_for_frame(0);
         aero_poll(node);
         aero_tick(node, k);
