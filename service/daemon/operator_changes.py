@@ -78,7 +78,7 @@ class OperatorChanges:
         """Serve `set_gains`, `track` and `show`."""
         self._role.serve("set_gains", Gains, self._prepare_gains)
         self._role.serve("track", Track, self._prepare_track)
-        self._role.serve("show", Request, lambda _: lambda: self.record)
+        self._role.serve("show", Request, lambda _: self.record)
 
     def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
         self._running()

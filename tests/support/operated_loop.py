@@ -64,11 +64,15 @@ class Query:
 
     def __init__(self, key: str, payload: bytes) -> None:
         self.key_expr, self.payload, self.attachment = key, _bytes(payload), None
-        self.answers: list[Answer] = []
+        self.replies: list[bytes] = []
+
+    @property
+    def answers(self) -> list[Answer]:
+        return [Answer.model_validate_json(payload) for payload in self.replies]
 
     def reply(self, key: str, payload: bytes) -> None:
         assert zenoh.KeyExpr(self.key_expr).includes(zenoh.KeyExpr(key))
-        self.answers.append(Answer.model_validate_json(payload))
+        self.replies.append(payload)
 
     def drop(self) -> None:
         """No further answer will come."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import zenoh
@@ -104,6 +105,32 @@ def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_t
     while loop.role.take_inbox():
         pass
     assert len(acted) == WAITING
+
+
+def test_a_loop_that_waits_for_its_inbox_goes_on_when_something_is_queued() -> None:
+    """By an event. Half the time-out is slack for a busy machine; a wait that misses the event takes all of it."""
+    role, acted, timeout_s = Loop(AT_REST).role, list[str](), 60.0
+    waits = threading.Event()
+
+    def queue_while_it_waits() -> None:
+        waits.wait()
+        role.enqueue(lambda: acted.append("later"))
+
+    begun_s = time.monotonic()
+    role.enqueue(lambda: acted.append("before"))
+    role.wait_for_inbox(timeout_s)
+    assert role.take_inbox()
+    thread = threading.Thread(target=queue_while_it_waits)
+    thread.start()
+    waits.set()
+    role.wait_for_inbox(timeout_s)
+    assert role.take_inbox()
+    thread.join()
+    assert acted == ["before", "later"]
+    assert time.monotonic() - begun_s < timeout_s / 2
+    begun_s = time.monotonic()
+    role.wait_for_inbox(0.02)  # nothing is queued any more
+    assert time.monotonic() - begun_s >= 0.02
 
 
 def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:

@@ -191,6 +191,24 @@ def claims_of(zenoh: Any, **role: Any) -> ClaimClient:
     return ClaimClient(node, LoopSettings(), WireSpec(), auto_arm=False)
 
 
+def test_a_record_is_encoded_once_however_often_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded, sent = list[SessionRecord](), list[bytes]()
+    encode = SessionRecord.encode
+
+    def counted(record: SessionRecord) -> bytes:
+        encoded.append(record)
+        return encode(record)
+
+    monkeypatch.setattr(SessionRecord, "encode", counted)
+    claims = claims_of(SimpleNamespace(get=lambda *_, payload, **__: sent.append(payload)))
+    claims.session = "s"
+    first, second = record_of("c"), record_of("c", within_s=5.0)
+    for record in (first, first, first, second, second):
+        claims.keep(record)
+    assert [SessionRecord.model_validate_json(payload) for payload in sent] == [first] * 3 + [second] * 2
+    assert encoded == [first, second]
+
+
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:
     sent = list[tuple[str, SessionRecord]]()
     handlers = list[Callable[[Any], None]]()
