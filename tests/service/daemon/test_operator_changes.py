@@ -30,6 +30,7 @@ from aeroloop.protocol.messages.operator import (
     Track,
 )
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.reference import Trajectory
 from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
@@ -547,7 +548,8 @@ def test_configured_follows_the_configuration_at_first_and_then_what_the_last_se
 
 def test_a_body_found_beyond_its_limit_of_tilt_is_approached_all_the_same() -> None:
     """Rolled by 120° and pitched by 85°, which is 92.5°, it passes 94° on its way to level."""
-    wire = WIRE.model_copy(update={"actuators": 3})  # which turn it about every axis
+    # Three actuators turn it about every axis.
+    wire = WireSpec(attitude=WIRE.attitude, rate=WIRE.rate, voltage=WIRE.voltage, actuators=3)
     loop = Loop(LEVEL, ControllerSettings(after_restart="resume"), wire=wire)
     loop.begin(record(LEVEL))
     attitude = WIRE.attitude.quantizer()
