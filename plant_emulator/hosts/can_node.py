@@ -7,6 +7,7 @@ The node's own heartbeat carries its state.
 
 from __future__ import annotations
 
+import time
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
@@ -60,6 +61,10 @@ class CanNetwork(PlantNetwork):
             if peer.state is PlantState.GRANTED:
                 self._begin(peer)
         self.follow_session()
+
+    def wait_for_inbox(self, timeout_s: float) -> None:
+        """Sleep: the bus has no event for what it receives."""
+        time.sleep(timeout_s)
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         del measurement, arrival, sent_ns

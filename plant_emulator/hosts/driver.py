@@ -45,6 +45,10 @@ class PlantNetwork(ABC):
         """Between two ticks, process what was received: claims, releases, operator commands."""
 
     @abstractmethod
+    def wait_for_inbox(self, timeout_s: float) -> None:
+        """Wait until there is something for `take_inbox`, at most so long [s]."""
+
+    @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """After a measurement was sent, at `sent_ns` on the monotonic clock: trace row, events, a due status.
 
@@ -125,7 +129,7 @@ class Driver:
         while not self._stop.is_set():
             network.take_inbox()
             if network.link is None or network.steps == 0:
-                self._clock.sleep(IDLE_WAIT_S if network.link is None else 0)
+                network.wait_for_inbox(IDLE_WAIT_S)
                 network.follow_session()
                 continue
             echo = self._tick(arrival, self._endpoint.ticked + 1)

@@ -104,7 +104,7 @@ class ZenohNetwork(PlantNetwork):
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
         role.serve("record", SessionRecord, self._keep_record)
-        role.serve("show", Request, lambda _: self._show)
+        role.serve("show", Request, lambda _: self._last_record())
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
         role.serve("stop", Request, lambda _: self._once_kept(self._stop))
         role.serve("mark", Mark, lambda mark: lambda: self._mark(mark.text))
@@ -129,6 +129,9 @@ class ZenohNetwork(PlantNetwork):
             self._read_others()
         if self._role.take_inbox():
             self.follow_session()
+
+    def wait_for_inbox(self, timeout_s: float) -> None:
+        self._role.wait_for_inbox(timeout_s)
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         endpoint = self._endpoint
@@ -263,7 +266,8 @@ class ZenohNetwork(PlantNetwork):
         self.steps += self._loop.ticks(seconds)
         return Answer(done=True, text=f"goes on for {seconds:g} s")
 
-    def _show(self) -> SessionRecord | Answer:
+    def _last_record(self) -> SessionRecord | Answer:
+        """For any thread: the endpoint replaces its record, which is frozen, as a whole."""
         return self._endpoint.last or Answer(done=False, text=f"{self._role.vehicle} has no record of a session")
 
     def _read_others(self) -> None:

@@ -70,6 +70,21 @@ def _asker(query: zenoh.Query) -> str:
     return ""
 
 
+class EncodedOnce:
+    """Encodes messages; the last one, as long as it is the same object, only once. For any thread."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Message, bytes] | None = None
+
+    def bytes_of(self, message: Message) -> bytes:
+        """The message as JSON."""
+        last = self._last
+        if last is None or last[0] is not message:
+            last = message, message.encode()
+            self._last = last
+        return last[1]
+
+
 class Node:
     """A process's presence on the network: answers for its description and status, and publishes what its owner says.
 
@@ -105,6 +120,7 @@ class Node:
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._publishers: dict[str, CachedPublisher] = {}
         self._inbox: deque[Action] = deque()
+        self._queued = threading.Event()  # set with every action; `wait_for_inbox` clears it
         self._long = Throttle(LONG_S, clock)
         self._last: tuple[float, Status] | None = None  # status, and when it was taken; another thread reads it
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
@@ -129,17 +145,19 @@ class Node:
 
     # ── requests ──
 
-    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
+    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message] | Message]) -> None:
         """Answer a topic's queries between ticks: when the owner of the loop calls `take_inbox`.
 
         A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
         is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
         `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
         returns runs between ticks and returns the reply. An AeroloopError from either is the reply. Both run in the
-        context of the operator in the query's attachment, `ASKED_BY`.
+        context of the operator in the query's attachment, `ASKED_BY`. A message that `prepare` returns instead is the
+        reply, sent at once; however often the same one is asked for, it is encoded once.
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
+        encoded = EncodedOnce()
 
         def reply(query: zenoh.Query, work: Callable[[], Message | None]) -> None:
             try:
@@ -147,7 +165,7 @@ class Node:
             except AeroloopError as error:
                 answer = Answer(done=False, text=str(error))
             if answer is not None:
-                query.reply(key, answer.encode())  # not the query's key, which may name many vehicles
+                query.reply(key, encoded.bytes_of(answer))  # not the query's key, which may name many vehicles
                 query.drop()
 
         def received(query: zenoh.Query) -> None:
@@ -157,11 +175,14 @@ class Node:
                 query.drop()
                 return
 
-            def accept() -> None:
+            def accept() -> Message | None:
                 if len(self._inbox) >= WAITING:
                     raise MessageError(f"{WAITING} requests wait already; ask again")
-                action = prepare(self._read(topic, model, payload))
-                self.enqueue(lambda: reply(query, action))
+                prepared = prepare(self._read(topic, model, payload))
+                if isinstance(prepared, Message):
+                    return prepared
+                self.enqueue(lambda: reply(query, prepared))
+                return None
 
             asked = ASKED_BY.set(_asker(query))
             try:
@@ -182,6 +203,13 @@ class Node:
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
         self._inbox.append(partial(copy_context().run, action))
+        self._queued.set()
+
+    def wait_for_inbox(self, timeout_s: float) -> None:
+        """Wait until an action is queued, at most so long [s]."""
+        if not self._inbox:
+            self._queued.wait(timeout_s)
+        self._queued.clear()
 
     def take_inbox(self) -> bool:
         """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""

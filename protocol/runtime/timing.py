@@ -17,11 +17,15 @@ from aeroloop.protocol.messages.models import LATENCY_BOUNDS_US, LatencyCounts, 
 
 
 class Clock(Protocol):
-    """What a loop needs of the module `time`, which is the real clock: seconds, nanoseconds, ns since 1970."""
+    """What a loop needs of the module `time`, which is the real clock: seconds, nanoseconds, ns since 1970.
+
+    `thread_time` is the calling thread's time on a CPU [s], which does not pass while the thread waits or is halted.
+    """
 
     def monotonic(self) -> float: ...  # noqa: D102
     def monotonic_ns(self) -> int: ...  # noqa: D102
     def time_ns(self) -> int: ...  # noqa: D102
+    def thread_time(self) -> float: ...  # noqa: D102
     def sleep(self, seconds: float, /) -> None: ...  # noqa: D102
 
 

@@ -50,6 +50,15 @@ class Approach(NamedTuple):
     run_up_s: Vector | None = None  # in which each runs up to the rate of the target at its end [s]
     here: tuple[Vector, Vector, Vector] | None = None  # angles [rad], rates and accelerations to begin from
 
+    @property
+    def state(self) -> Angles | None:
+        """The state it begins from, of shapes (1, 3); None for that of the present reference."""
+        if self.start is not None:
+            return at_rest(self.start)
+        if self.here is not None:
+            return Angles(*(np.array([row]) for row in self.here))
+        return None
+
     def at_least(self, within_s: float) -> Approach:
         """This shortest approach, extended to `within_s` if that is longer."""
         return self._replace(within_s=max(within_s, self.within_s))
@@ -149,6 +158,8 @@ def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limi
     A quintic is taken if it goes no further beyond its start or its target than braking does, within the limits or
     within `within_s`. Raises FollowError if there is no approach.
     """
+    if _is_surely_within(target.first.angle, here, within_s, limits):
+        return Approach(within_s, here=here.row)
     brake_s = np.maximum(braking_times(here, limits), within_s)
     ends = np.concatenate([here.angle, target.first.angle])
     stops_within = np.abs(here.rate[0]) * brake_s / 2 + np.abs(here.acceleration[0]) * brake_s**2 / 12
@@ -166,16 +177,28 @@ def to_set_point(target: Trajectory, here: Angles, within_s: float, limits: Limi
     return shortest(target, here, limits).at_least(within_s)
 
 
+def _is_surely_within(target: Floats, here: Angles, within_s: float, limits: Limits) -> bool:
+    """Whether the quintic from a state to rest at `target` [rad], shape (1, 3), keeps the limits by its control points.
+
+    Angle and rate stay within the convex hulls of the control points of their Bernstein forms, and the bounds of tilt
+    and speed are convex. The control points of the angle lie no further from both ends than a braking in `within_s`.
+    """
+    angle, rate, acceleration = here
+    second = angle + rate * (2 * within_s / 5) + acceleration * (within_s**2 / 20)
+    angles = np.concatenate([angle, angle + rate * (within_s / 5), second, target])
+    rates = np.concatenate([rate, rate + acceleration * (within_s / 4), 5 * (target - second) / within_s])
+    control = Angles(angles, rates, rates)
+    return bool(control.tilt_bounds().max() <= limits.tilt and control.speed_bounds().max() <= limits.rate)
+
+
 def approached(target: Trajectory, here: Angles, t: float, approach: Approach) -> Trajectory:
     """A trajectory that reaches the target by an approach; the target's own time begins when it is reached.
 
     It begins at time t [s] from the state `here`, of shapes (1, 3), unless the approach has one of its own.
     """
-    within_s, start, brake, run_up, begin = approach
-    if start is not None:
-        here = at_rest(start)
-    elif begin is not None:
-        here = Angles(*(np.array([row]) for row in begin))
+    within_s, brake, run_up, begin = approach.within_s, approach.brake_s, approach.run_up_s, approach.state
+    if begin is not None:
+        here = begin
     there = target.first
     if brake is None or run_up is None:
         if not within_s:
@@ -218,7 +241,9 @@ class Motion:
 
     def follow(self, target: Trajectory, t: float, approach: Approach) -> None:
         """Follow another trajectory from time t [s] on, by an approach; its own time begins when it is reached."""
-        self.trajectory = trajectory = approached(target, self.here(t), t, approach)
+        begin = approach.state
+        here = self.here(t) if begin is None else begin
+        self.trajectory = trajectory = approached(target, here, t, approach)
         self._load(trajectory.piece(t))
 
     def change(self, change: Change, period: float) -> None:
@@ -237,9 +262,7 @@ class Motion:
     def here(self, t: float) -> Angles:
         """Roll, pitch, yaw, their rates and accelerations at time t [s]. Shapes (1, 3)."""
         i = self.trajectory.piece(t)
-        tau = np.zeros((len(self.trajectory.starts), 1))
-        tau[i] = t - self.trajectory.starts[i]
-        return Angles(*(part[i] for part in self.trajectory.at(tau)))
+        return self.trajectory.state(i, t - self.trajectory.starts[i])
 
     def _load(self, i: int) -> None:
         trajectory, inputs = self.trajectory, self._function.inputs

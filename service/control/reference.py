@@ -13,7 +13,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
 from itertools import product as combinations
-from math import asin, degrees, lcm, pi, radians
+from math import acos, asin, cos, degrees, lcm, pi, radians
 from typing import Final, NamedTuple
 
 import casadi as ca
@@ -33,6 +33,11 @@ Floats = NDArray[np.float64]
 POWERS: Final = 6
 SAMPLES: Final = 65
 """Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
+_BASIS: Final = np.linspace(0.0, 1.0, SAMPLES) ** np.arange(POWERS)[:, None]
+"""Powers, a row each, of the samples' times as shares of a piece."""
+_CHUNK: Final = 200
+"""Pieces that are sampled at once to check a reference: they fit a CPU's cache, and BLAS starts no thread for so few,
+nor is Python's lock held for longer than a loop in the same process can wait."""
 _CELLS: Final = {1: 512, 2: 96, 3: 36}  # of each free phase to begin with, by the number of free phases
 _MOST_CELLS: Final = 100_000
 _TOLERANCE: Final = 1e-7  # share by which a supremum may exceed the largest value found, unless that takes more cells
@@ -80,6 +85,19 @@ class Angles(NamedTuple):
     def tilts(self) -> Floats:
         """Angles between the body's z axis and the vertical [rad]. Shape (n,)."""
         return np.asarray(np.arccos(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1])))
+
+    def speed_bounds(self) -> Floats:
+        """Bounds of `speeds` that need no sine [rad/s]: √(θ̇² + (|φ̇| + |ψ̇|)²). Shape (n,)."""
+        roll, pitch, yaw = self.rate.T
+        return np.asarray(np.sqrt(pitch**2 + (np.abs(roll) + np.abs(yaw)) ** 2))
+
+    def tilt_bounds(self) -> Floats:
+        """Bounds of `tilts` that need no cosine [rad]: |φ| + |θ|, one turn after the other. Shape (n,)."""
+        return np.asarray(np.abs(self.angle[:, 0]) + np.abs(self.angle[:, 1]))
+
+    def rows(self, selected: NDArray[np.bool_]) -> Angles:
+        """The selected rows."""
+        return Angles(*(part[selected] for part in self))
 
 
 class Trajectory(NamedTuple):
@@ -129,7 +147,8 @@ class Trajectory(NamedTuple):
     @property
     def first(self) -> Angles:
         """The state at its start. Shapes (1, 3)."""
-        return Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
+        angle, rate, twice = self.quintic[:1, 0], self.quintic[:1, 1], self.quintic[:1, 2]
+        return Angles(angle, rate + self.amplitude[:1] * self.frequency[:1], 2 * twice)
 
     def after(self, starts: Floats, lengths: Floats, knots: Angles) -> Trajectory:
         """This trajectory from the last of these times on, preceded by quintics through the states `knots` at them.
@@ -145,6 +164,14 @@ class Trajectory(NamedTuple):
     def piece(self, t: float) -> int:
         """Index of the piece that contains time t [s]."""
         return max(0, int(np.searchsorted(self.starts, t, side="right")) - 1)
+
+    def pieces(self, begin: int, end: int) -> Trajectory:
+        """The pieces from index `begin` until before `end`, the last of which is taken never to end."""
+        return Trajectory(*(part[begin:end] for part in self))
+
+    def state(self, i: int, tau: float) -> Angles:
+        """The state in piece i at time τ since its start [s]. Shapes (1, 3)."""
+        return Angles(*(part[0] for part in self.pieces(i, i + 1).at(np.array([[tau]]))))
 
     def at(self, tau: Floats) -> Angles:
         """Angles of every piece at times τ since its start [s]. Shape of τ: (n, m), of the angles (n, m, 3)."""
@@ -162,9 +189,24 @@ class Trajectory(NamedTuple):
         )
 
     def samples(self) -> Angles:
-        """Samples of the quintics, dense enough for their extremes, concatenated. Shapes (n, 3)."""
-        lengths = np.append(np.diff(self.starts), 0.0)
-        return Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, SAMPLES))))
+        """Samples of the quintics, dense enough for their extremes, piece after piece. Shapes (n, 3)."""
+        return Angles(*self._sampled(3))
+
+    def _sampled(self, count: int) -> list[Floats]:
+        """The first `count` of the quintics' angle, rate, acceleration and jerk at the samples [rad/sᵖ], (n, 3) each.
+
+        The columns are contiguous. The last piece, which does not move, has its samples, too.
+        """
+        lengths = np.append(np.diff(self.starts), 0.0)[:, None]
+        coefficients = self.quintic
+        sampled = []
+        for _ in range(count):
+            powers = np.arange(coefficients.shape[1])
+            of_shares = coefficients * (lengths**powers)[:, :, None]
+            by_axis = of_shares.transpose(2, 0, 1).reshape(-1, len(powers))
+            sampled.append((by_axis @ _BASIS[: len(powers)]).reshape(3, -1).T)
+            coefficients = coefficients[:, 1:] * powers[1:, None]
+        return sampled
 
     @property
     def swings(self) -> bool:
@@ -173,11 +215,8 @@ class Trajectory(NamedTuple):
 
     def peaks(self) -> Floats:
         """The largest |angle|, |rate|, |acceleration| and |jerk| of roll, pitch, yaw [rad/sᵖ]. Shape (4, 3)."""
-        ends = np.append(np.diff(self.starts), 0.0)[:, None, None] * np.linspace(0, 1, SAMPLES)[:, None]
-        c = self.quintic[:, None]
-        jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2).reshape(-1, 3)
         swing, f = np.abs(self.amplitude[-1]) * (self.frequency[-1] > 0), self.frequency[-1]
-        largest = [np.abs(part).max(axis=0) for part in (*self.samples(), jerk)]
+        largest = [np.abs(part).max(axis=0) for part in self._sampled(4)]
         return np.asarray(np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3]))
 
     def largest(self, value: Callable[[Angles], Floats], terms: Floats) -> float:
@@ -229,7 +268,10 @@ class Trajectory(NamedTuple):
     def check(self, limits: Limits) -> None:
         """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
         with np.errstate(over="ignore", invalid="ignore"):  # a rate that is not finite counts as too fast
-            fastest, tilt = self.fastest(), self.steepest()
+            if self.swings:
+                fastest, tilt = self.fastest(), self.steepest()
+            else:
+                fastest, tilt = self._beyond(limits)
         if not fastest <= limits.rate * _LIMIT_SLACK:
             raise FollowError(
                 f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
@@ -242,6 +284,23 @@ class Trajectory(NamedTuple):
             )
         if not limits.rolls and self.peaks()[0, 0] > 0:
             raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
+
+    def _beyond(self, limits: Limits) -> tuple[float, float]:
+        """The largest angular velocity [rad/s] and tilt [rad] of a trajectory that comes to rest, where beyond limits.
+
+        Sines and cosines are computed only of the samples of which a quicker bound is not within the limit. What is
+        within it counts as 0, but for the attitude that is held at last.
+        """
+        speeds = [0.0]
+        roll, pitch, _ = self.quintic[-1, 0].tolist()
+        tilts = [acos(cos(roll) * cos(pitch))]
+        for begin in range(0, len(self.starts) - 1, _CHUNK):
+            samples = self.pieces(begin, begin + _CHUNK + 1).samples()
+            fast = samples.rows(~(samples.speed_bounds() <= limits.rate))
+            tilted = samples.rows(~(samples.tilt_bounds() <= limits.tilt))
+            speeds.append(float(fast.speeds().max(initial=0.0)))
+            tilts.append(float(tilted.tilts().max(initial=0.0)))
+        return float(np.max(speeds)), float(np.max(tilts))
 
 
 def turning(amplitude: Floats) -> Floats:

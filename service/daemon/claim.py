@@ -13,7 +13,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, MessageError
-from aeroloop.protocol.runtime.node import Node, log_event
+from aeroloop.protocol.runtime.node import EncodedOnce, Node, log_event
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
@@ -35,6 +35,7 @@ class ClaimClient:
         self.last: SessionRecord | None = None  # of the vehicle's last session, from the last grant
         self.by_datagrams = False  # whether the last claim's frames travel as datagrams
         self._kept: SessionRecord | None = None  # the last record that the plant has confirmed
+        self._encoded = EncodedOnce()  # the record, which is sent again until it is confirmed
 
     def claim(self) -> ZenohLink | None:
         """Claim the vehicle. The link is opened before the query, so that the first measurement is not lost."""
@@ -76,8 +77,9 @@ class ClaimClient:
                 if reply.ok and Answer.decode(reply.ok.payload.to_bytes()).done:
                     self._kept = record
 
+        payload = self._encoded.bytes_of(record)
         drop, key = zenoh.CongestionControl.DROP, topics.key("record", self._role.vehicle)
-        self._role.zenoh.get(key, answered, payload=record.encode(), timeout=ANSWER_WAIT_S, congestion_control=drop)
+        self._role.zenoh.get(key, answered, payload=payload, timeout=ANSWER_WAIT_S, congestion_control=drop)
 
     def release(self) -> None:
         """Release the session, whether or not the plant still answers."""

@@ -41,7 +41,7 @@ from aeroloop.service.control.motion import START_WITHIN_DEG, Approach, shortest
 from aeroloop.service.control.reference import FollowError, Limits, Trajectory
 
 START_S: Final = 1.0  # least time to reach a reference that no operator gave a time for, at a session's start [s]
-SETPOINTS: Final = 4  # set-points of a stream that are read before a tick; of more, the newest
+SETPOINTS: Final = 4  # set-points of a stream that wait for a tick, the newest; only if it is refused, the one before
 _DECIMALS: Final = 3  # of an attitude found [deg]: far finer than any level, and short to print
 
 
@@ -78,7 +78,7 @@ class OperatorChanges:
         """Serve `set_gains`, `track` and `show`."""
         self._role.serve("set_gains", Gains, self._prepare_gains)
         self._role.serve("track", Track, self._prepare_track)
-        self._role.serve("show", Request, lambda _: lambda: self.record)
+        self._role.serve("show", Request, lambda _: self.record)
 
     def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
         self._running()
@@ -217,28 +217,42 @@ class OperatorChanges:
 
     def _follow_stream(self, stream: Stream) -> None:
         """Follow the newest set-point received since the last tick that is not refused; report a silent stream."""
-        now_s, newest = self._role.clock.monotonic(), None
-        for _ in range(SETPOINTS):
-            if (sample := self._received.try_recv()) is None:
-                break
-            try:
-                hold = Hold(attitude=Setpoint.decode(sample.payload.to_bytes()).attitude)
-                trajectory = Trajectory.of(hold)
-                trajectory.check(self._limits)
-                newest = hold, trajectory
-            except (MessageError, FollowError) as error:
-                self._refuse_setpoint(error)
+        now_s = self._role.clock.monotonic()
+        newest = self._newest_setpoint()
         if newest is not None:
             self._setpoint_s = now_s
+            trajectory = Trajectory.of(newest)
             try:
                 here = self._running().motion.here(self._time)
-                self._follow(*newest, to_set_point(newest[1], here, stream.within_s, self._limits))
+                self._follow(newest, trajectory, to_set_point(trajectory, here, stream.within_s, self._limits))
             except FollowError as error:
                 self._refuse_setpoint(error)
         elif self._setpoint_s and now_s - self._setpoint_s > stream.timeout_s:
             self._setpoint_s = 0.0
             text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
             self._role.event("lost", text, self.record.session, self._k)
+
+    def _newest_setpoint(self) -> Hold | None:
+        """The newest set-point received since the last tick that is not refused. Older ones are not looked at."""
+        for payload in reversed(self._take_setpoints()):
+            try:
+                hold = Hold(attitude=Setpoint.decode(payload).attitude)
+                Trajectory.of(hold).check(self._limits)
+            except (MessageError, FollowError) as error:
+                self._refuse_setpoint(error)
+            else:
+                return hold
+        return None
+
+    def _take_setpoints(self) -> list[bytes]:
+        """Payloads of the set-points received since this was last called, the newest last."""
+        payloads: list[bytes] = []
+        for _ in range(SETPOINTS):
+            sample = self._received.try_recv()
+            if sample is None:
+                break
+            payloads.append(sample.payload.to_bytes())
+        return payloads
 
     def _refuse_setpoint(self, error: AeroloopError) -> None:
         self.refused += 1

@@ -42,8 +42,8 @@ READ_S: Final = 0.01  # least time between two readings of the plant's status [s
 STALL_TICKS: Final = 10  # ticks missed in a row that cause a warning
 TELEMETRY_HZ: Final = 10.0  # telemetry is for people: the trace has every tick [Hz]
 LAW_TIMEOUT_S: Final = 0.1
-"""A tick of the law that takes longer faults the controller, except in lockstep [s]. By then the plant's watchdog, with
-its default time, has set 0 V."""
+"""A tick of the law that takes longer on a CPU faults the controller, except in lockstep [s]. By then the plant's
+watchdog, with its default time, has set 0 V. Time in which the host halts the process is not the law's."""
 REPORT_S: Final = 1.0  # a tick that lasts longer is reported while it lasts [s]
 STOP_S: Final = 2.0  # how long a hanging tick may outlast a request to stop [s]
 CHECK_S: Final = 0.1  # how often a law in Python is checked [s]
@@ -175,13 +175,15 @@ class Session:
         shared.changes.before_tick(now.tick, now.frame)
         if not self._may_continue():
             return
-        shared.watch.begun = began = clock.monotonic()
+        shared.watch.begun = clock.monotonic()
+        began_s = clock.thread_time()
         command = self.controller.tick(now.frame, now.tick)
-        took_s, shared.watch.begun = clock.monotonic() - began, None
+        took_s = clock.thread_time() - began_s
+        shared.watch.begun = None
         fault = self.controller.fault
         if took_s > LAW_TIMEOUT_S and not self._lockstep:
             command = None
-            fault = f"law {self.controller.law.settings.kind} took {took_s:.3g} s for a tick"
+            fault = f"law {self.controller.law.settings.kind} took {took_s:.3g} s of CPU time for a tick"
         if command or (command is not None and self._lockstep):
             self._link.send(command)
         self._k = now.tick

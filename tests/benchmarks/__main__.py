@@ -1,6 +1,6 @@
 """What the product costs, each figure beside its floor: `uv run python -m tests.benchmarks [PART ...]`.
 
-    … [--turns 3] [--seconds 20] [--rate 500] [--log-s 60] [--set KEY=VALUE] [tick loop start cell log]
+    … [--turns 3] [--seconds 20] [--rate 500] [--log-s 60] [--set KEY=VALUE] [tick stream loop start cell log]
 
 Product and floor take turns, so that both have the same share of what else the machine does; a row has the medians. A
 floor is what nobody could do without: the law's function alone, the `mcap` library's reader. Nothing is asserted.
@@ -9,6 +9,7 @@ floor is what nobody could do without: the law's function alone, the `mcap` libr
 from __future__ import annotations
 
 import argparse
+import math
 import subprocess
 import sys
 import tempfile
@@ -20,16 +21,20 @@ from statistics import median
 
 from mcap.reader import make_reader
 
+from aeroloop.protocol.messages.operator import MAX_POINTS, Points, Stream
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, tick_function
 from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.lab import loop_function
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import review
+from aeroloop.service.settings import ControllerSettings
 from tests.benchmarks import loop
 from tests.support.made_log import make_log
+from tests.support.operated_loop import Loop
 
 Row = tuple[str, float, float | None, str]
 """A figure, its floor if it has one, and what the floor is."""
@@ -66,6 +71,29 @@ def tick(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
 
     ours, floor = in_turns(10 * given.turns, ticks, evaluations)
     yield "controller's tick, µs", 1e6 * ours / len(frames), 1e6 * floor / len(frames), "its CasADi function alone"
+
+
+def set_points(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
+    """The tick that takes up a set-point, however many have come since the last, and the check of a long reference."""
+    ticks = 500
+    yaws = [20 * math.sin(0.001 * n) for n in range(ticks)]
+
+    def follow(per_tick: int) -> None:
+        stream = Loop(Stream())
+        stream.begin()
+        for yaw in yaws:
+            for _ in range(per_tick):
+                stream.stream(yaw)
+            stream.tick()
+
+    for per_tick in (1, 10):
+        ours, floor = in_turns(given.turns, partial(follow, per_tick), partial(follow, 0))
+        yield f"tick with {per_tick} set-points, µs", 1e6 * ours / ticks, 1e6 * floor / ticks, "a tick without"
+    attitudes = [(0.0, 20 * math.sin(0.03 * n), 40 * math.sin(0.011 * n)) for n in range(MAX_POINTS)]
+    points = Points(times=[n / 10 for n in range(MAX_POINTS)], attitudes=attitudes)
+    trajectory, limits = Trajectory.of(points), Limits.of(ControllerSettings(), actuators=2)
+    ours, floor = in_turns(given.turns, partial(trajectory.check, limits), partial(Trajectory.of, points))
+    yield f"check of {MAX_POINTS} points, ms", 1e3 * ours, 1e3 * floor, "their coefficients"
 
 
 def real_time(given: argparse.Namespace, _: Settings) -> Iterator[Row]:
@@ -118,7 +146,7 @@ def log(given: argparse.Namespace, settings: Settings) -> Iterator[Row]:
             yield f"{what} of {given.log_s:g} s of log, s", ours, floor, "its messages read by mcap"
 
 
-PARTS = {"tick": tick, "loop": real_time, "start": start_up, "cell": cell, "log": log}
+PARTS = {"tick": tick, "stream": set_points, "loop": real_time, "start": start_up, "cell": cell, "log": log}
 
 
 def main() -> None:

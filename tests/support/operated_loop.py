@@ -64,11 +64,15 @@ class Query:
 
     def __init__(self, key: str, payload: bytes) -> None:
         self.key_expr, self.payload, self.attachment = key, _bytes(payload), None
-        self.answers: list[Answer] = []
+        self.replies: list[bytes] = []
+
+    @property
+    def answers(self) -> list[Answer]:
+        return [Answer.model_validate_json(payload) for payload in self.replies]
 
     def reply(self, key: str, payload: bytes) -> None:
         assert zenoh.KeyExpr(self.key_expr).includes(zenoh.KeyExpr(key))
-        self.answers.append(Answer.model_validate_json(payload))
+        self.replies.append(payload)
 
     def drop(self) -> None:
         """No further answer will come."""
@@ -105,15 +109,17 @@ class LonelyNode(Node):
 class Loop:
     """What the daemon does around OperatorChanges; `log` has each session's ticks, measurements and commands."""
 
-    def __init__(self, reference: Reference, settings: ControllerSettings = CONFIGURED) -> None:
+    def __init__(
+        self, reference: Reference, settings: ControllerSettings = CONFIGURED, *, wire: WireSpec = WIRE
+    ) -> None:
         self.clock = FakeClock()
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(node, "join", lambda *_: self.network)
             self.role = LonelyNode("controller", "aero", NetworkSettings(), {}, name="controller-7", clock=self.clock)
-        self.configured = reference
-        self.trace = TraceWriter("controller", WIRE, 1)
-        configured = Settings(law=LAW, reference=reference, controller=settings, wire=WIRE)
+        self.configured, self.wire = reference, wire
+        self.trace = TraceWriter("controller", wire, 1)
+        configured = Settings(law=LAW, reference=reference, controller=settings, wire=wire)
         self.live = OperatorChanges(self.role, configured, self.trace, lambda: "controller-7 does not have aero")
         self.live.serve()
         self.controller = self.fresh()
@@ -121,7 +127,7 @@ class Loop:
         self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}
 
     def fresh(self, reference: Reference | None = None) -> Controller:
-        return Controller(WIRE, LAW, reference or self.configured, PERIOD)
+        return Controller(self.wire, LAW, reference or self.configured, PERIOD)
 
     # The loop
 

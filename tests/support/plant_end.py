@@ -258,6 +258,9 @@ class Stage(PlantNetwork):
             self.clock.advance((skipped + 0.5) * self.loop.period)
         self.follow_session()
 
+    def wait_for_inbox(self, timeout_s: float) -> None:
+        self.clock.sleep(timeout_s)
+
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         self.trace.row(self.endpoint, measurement, arrival, sent_ns)
         self.wires.tick = self.endpoint.ticked

@@ -12,6 +12,7 @@ import pytest
 from aeroloop.plant_emulator.endpoint.endpoint import Notice
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS
 from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
+from aeroloop.plant_emulator.hosts.driver import IDLE_WAIT_S
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -58,6 +59,24 @@ def test_a_session_begins_on_the_grid_however_long_its_grant_took_and_counts_the
     assert rows(batches, "tick") == [*range(11, 16), 19, 20]
     assert [WIRE.measurement.counter(frame) for frame in stage.wires.sent] == [0, 1, 2, 3, 4, 8, 9]
     assert stage.skipped == 3  # what was held up before the session does not count
+
+
+def test_a_plant_that_steps_on_request_waits_for_requests_and_does_not_spin() -> None:
+    passes = 0
+
+    def between(stage: Stage) -> None:
+        nonlocal passes
+        passes += 1
+        if passes == 1:
+            stage.claim()
+        if passes == 5:
+            stage.steps = 3
+
+    stage = Stage(LoopSettings(realtime="off", lockstep=True), WIRE, PLANT, between=between, answer=answer)
+    stage.steps = 0
+    stage.run(2)
+    assert len(stage.wires.sent) == 3
+    assert stage.clock.slept == [IDLE_WAIT_S] * 4  # each pass before the request
 
 
 def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:

@@ -77,6 +77,22 @@ def test_two_plants_of_a_vehicle_that_meet_both_trip_until_one_has_ended_and_the
         assert first.cause is None
 
 
+def test_its_last_record_is_shown_without_its_loop() -> None:
+    """So that encoding one of many points, however often it is asked for, costs the loop nothing."""
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
+        endpoint = PLANT.endpoint(PLANT.make(LOOP.period), LOOP, WIRE)
+        ZenohNetwork(role, LOOP, endpoint, PLANT).serve()  # no driver takes what is queued
+        zenoh, answers = gathering.join(), list[bytes]()
+
+        def ask() -> bool:
+            replies = zenoh.get(topics.key("show", "aero"), timeout=1.0)
+            answers.extend(reply.ok.payload.to_bytes() for reply in replies if reply.ok)
+            return bool(answers)
+
+        eventually("an answer", ask)
+        assert Answer.decode(answers[0]).text == "aero has no record of a session"
+
+
 # ── the latch's file ──
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Description, Status
 from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
 from aeroloop.protocol.transport.network_settings import NetworkError
@@ -120,8 +122,34 @@ def test_the_token_of_a_plant_that_does_not_answer_keeps_another_out_only_while_
             with Node("plant", "aero", gathering.settings, {}) as role:
                 assert role.role == "plant"
         else:
-            with pytest.raises(NetworkError, match="has a plant already .which does not answer"):
+            with pytest.raises(NetworkError, match=r"has a plant already \(which does not answer"):
                 Node("plant", "aero", gathering.settings, {})
+
+
+def test_a_loop_that_waits_for_its_inbox_goes_on_when_something_is_queued() -> None:
+    """By an event. Half the time-out is slack for a busy machine; a wait that misses the event takes all of it."""
+    role, acted, timeout_s = Loop(AT_REST).role, list[str](), 60.0
+    waits = threading.Event()
+
+    def queue_while_it_waits() -> None:
+        waits.wait()
+        role.enqueue(lambda: acted.append("later"))
+
+    begun_s = time.monotonic()
+    role.enqueue(lambda: acted.append("before"))
+    role.wait_for_inbox(timeout_s)
+    assert role.take_inbox()
+    thread = threading.Thread(target=queue_while_it_waits)
+    thread.start()
+    waits.set()
+    role.wait_for_inbox(timeout_s)
+    assert role.take_inbox()
+    thread.join()
+    assert acted == ["before", "later"]
+    assert time.monotonic() - begun_s < timeout_s / 2
+    begun_s = time.monotonic()
+    role.wait_for_inbox(0.02)  # nothing is queued any more
+    assert time.monotonic() - begun_s >= 0.02
 
 
 def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:
@@ -146,3 +174,11 @@ def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing()
         assert seen == [True]
         genuine.undeclare()
         eventually("it disappears", lambda: seen == [True, False])
+
+
+def test_a_description_names_the_process_as_its_statuses_do() -> None:
+    """So that a reader knows which of several controllers described itself."""
+    loop = Loop(AT_REST)
+    loop.role.status(Status(role="controller", state="running", uptime_s=0, ticks=0, rate_hz=0, skipped=0))
+    (description,), (status,) = loop.published("description", Description), loop.published("status", Status)
+    assert description.facts["process"] == status.process != ""

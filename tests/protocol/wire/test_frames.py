@@ -159,6 +159,16 @@ def test_in_lockstep_the_counter_gives_the_tick_at_any_time_and_a_frame_again_is
         assert (ticks.tick, ticks.late_ns(tick, at_ns)) == (tick, 0)
 
 
+@pytest.mark.parametrize("counters", [16, 256])
+def test_a_counter_stands_for_a_tick_from_three_quarters_of_its_range_before_now_to_one_after(counters: int) -> None:
+    """4 bits: from 12 ticks before the grid's present one to 3 after it."""
+    now = 2 * counters
+    for tick in range(now - 3 * counters // 4, now + counters // 4):
+        ticks = TickCounter(PERIOD_NS, counters, lockstep=False)
+        ticks.advance(0, 0)
+        assert ticks.advance(tick % counters, now * PERIOD_NS) == tick
+
+
 def test_how_late_a_frame_is_counts_from_the_fastest_ones() -> None:
     start, late = 10**15, 3_000_000
     ticks = TickCounter(PERIOD_NS, 256, lockstep=False)

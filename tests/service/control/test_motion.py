@@ -19,7 +19,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
+from aeroloop.protocol.messages.operator import MAX_POINTS, Hold, Points, Reference, Sinusoid, Stream
 from aeroloop.service.control.motion import (
     LEAST_TURN_S,
     Approach,
@@ -27,6 +27,7 @@ from aeroloop.service.control.motion import (
     approached,
     at_rest,
     braked,
+    braking_times,
     shortest,
     to_set_point,
 )
@@ -388,6 +389,18 @@ def test_near_the_limits_of_rate_and_tilt_it_brakes_harder(pitch: float, rate: f
     assert np.abs(angles).max() <= BENCH.tilt * SAMPLED
 
 
+@settings(max_examples=100)
+@example(state=of_axis(1, 0.0, 0.0, 0.5))
+@given(state=any_states())
+def test_an_axis_brakes_within_1_rad_per_s2_or_with_what_it_begins(state: Angles) -> None:
+    """Unless a limit of rate or tilt is near."""
+    brake_s = braking_times(state, NO_LIMITS)
+    stopping_way = braked(state, brake_s, np.linspace(0.0, float(brake_s.max()), 481))
+    most = np.maximum(1.0, np.abs(state.acceleration[0]))
+    assert np.all(np.abs(stopping_way.acceleration) <= most * (1 + ROUNDING))
+    assert np.all(brake_s[state.acceleration[0] != 0] >= 0.1)  # it is let go no quicker
+
+
 @settings(max_examples=40)
 @given(history=histories)
 def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Reference, float, float]]) -> None:
@@ -455,6 +468,15 @@ def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hol
     assert np.all(angles <= ends.max(axis=0) + margin)
 
 
+def test_a_quintic_to_a_set_point_that_would_tilt_beyond_the_limit_is_not_taken() -> None:
+    """It stays within the distance of braking, but from 57° at 0.3 rad/s to 59.5° in 1 s it would reach 61.1°."""
+    start, target = of_axis(1, radians(57), 0.3, 0.0), Trajectory.of(Hold(attitude=(0.0, 59.5, 0.0)))
+    assert way(approached(target, start, 0.0, Approach(1.0)), target, 1.0).tilts().max() > radians(61)
+    approach = to_set_point(target, start, 1.0, BENCH)
+    tilts = way(approached(target, start, 0.0, approach), target, approach.within_s).tilts()
+    assert tilts.max() <= BENCH.tilt * SAMPLED
+
+
 ROLLS = Sinusoid(amplitude=(1.0, 0.0, 0.0), frequency=(0.3, 0.0, 0.0))
 
 
@@ -483,6 +505,73 @@ def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
         Trajectory.of(reference).check(limits)
     assert len(str(refused.value).splitlines()) == 1
     Trajectory.of(reference).check(NO_LIMITS)
+
+
+@settings(max_examples=60)
+@given(points=some_points())
+def test_points_are_refused_where_one_of_65_samples_of_a_piece_is_beyond_a_limit(points: Points) -> None:
+    trajectory = Trajectory.of(points)
+    edges = pairwise(trajectory.starts.tolist())
+    sampled = [piece_states(trajectory, i, np.linspace(a, b, 65)[:, None]) for i, (a, b) in enumerate(edges)]
+    samples = Angles(*(np.concatenate(parts) for parts in zip(*sampled, strict=True)))
+    fastest, tilt = float(samples.speeds().max()), float(samples.tilts().max())
+    assume(min(fastest, tilt) > 1e-3)
+    enough = Limits(fastest * (1 + ROUNDING), tilt * (1 + ROUNDING), rolls=True)
+    trajectory.check(enough)
+    for too_low in (enough._replace(rate=fastest * (1 - 2e-6)), enough._replace(tilt=tilt * (1 - 2e-6))):
+        with pytest.raises(FollowError):
+            trajectory.check(too_low)
+
+
+@pytest.mark.parametrize("fast", [0, 198, 199, 200, 201, 399, 400, 448])
+def test_one_piece_of_many_that_is_too_fast_or_too_tilted_is_found_wherever_it_is(fast: int) -> None:
+    """Many are checked 200 at a time."""
+    attitudes = [(0.0, 0.0, 1.0 * (n > fast)) for n in range(450)]
+    steps = Trajectory.of(Points(times=[float(n) for n in range(450)], attitudes=attitudes))
+    with pytest.raises(FollowError, match="max_reference_rate"):
+        steps.check(BENCH._replace(rate=radians(1.1)))
+    steps.check(BENCH._replace(rate=radians(2)))
+    attitudes = [(0.0, 61.0 * (n == fast), 0.0) for n in range(450)]
+    peak = Trajectory.of(Points(times=[1000.0 * n for n in range(450)], attitudes=attitudes))
+    with pytest.raises(FollowError, match="max_reference_tilt_deg"):
+        peak.check(BENCH)
+    peak.check(BENCH._replace(tilt=radians(90)))
+
+
+def test_of_points_within_the_limits_no_sines_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would take most of the time of a check of 10 000 points."""
+    computed = list[int]()
+
+    def count(samples: Angles) -> Array:
+        computed.append(len(samples.angle))
+        return np.zeros(len(samples.angle))
+
+    for name in ("speeds", "tilts"):
+        monkeypatch.setattr(Angles, name, count)
+    times, yaw = [n / 10 for n in range(MAX_POINTS)], 60 * np.sin(0.05 * np.arange(MAX_POINTS))
+    attitudes = [(0.0, angle / 2, angle) for angle in yaw.tolist()]
+    Trajectory.of(Points(times=times, attitudes=attitudes)).check(BENCH)
+    assert sum(computed) == 0
+
+
+@settings(max_examples=100)
+@example(of_axis(2, 0.0, 0.9, 0.0), (0.0, 0.0, 49.0), 1.0)  # it would turn at 1.3 rad/s
+@example(of_axis(1, radians(55), 0.0, 2.0), (0.0, 55.0, 0.0), 2.0)  # it would tilt by 63°
+@given(start=any_states(), target=turns, within_s=seconds(0.02, 5.0))
+def test_the_quintic_to_a_set_point_keeps_the_limits_whether_samples_or_control_points_say_so(
+    start: Angles, target: tuple[float, float, float], within_s: float
+) -> None:
+    """Where the control points keep them, the dense samples do, and they lie on the way that braking takes."""
+    trajectory = Trajectory.of(Hold(attitude=target))
+    try:
+        approach = to_set_point(trajectory, start, within_s, BODY)
+    except FollowError:
+        return
+    if approach.brake_s is not None or approach.within_s != within_s:
+        return
+    states = way(approached(trajectory, start, 0.0, approach), trajectory, within_s)
+    assert states.speeds().max() <= BODY.rate * SAMPLED
+    assert states.tilts().max() <= BODY.tilt * SAMPLED
 
 
 def test_what_stays_within_the_limits_is_not_refused() -> None:

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import accumulate
-from math import acos, degrees, hypot
+from math import acos, degrees, hypot, radians
 from typing import Any, Final
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.models import SessionRecord
 from aeroloop.protocol.messages.operator import (
+    MAX_POINTS,
     Change,
     Gains,
     Hold,
     Message,
     Points,
     Reference,
+    Request,
     Setpoint,
     Sinusoid,
     Stream,
     Track,
 )
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.reference import Trajectory
 from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import CONFIGURED, LEVEL, PERIOD, SWING, WIRE, Loop, gains_with, measured, turned
+from tests.support.numpy_twin import attitude_of
+from tests.support.operated_loop import (
+    AT_REST,
+    CONFIGURED,
+    LEVEL,
+    PERIOD,
+    SWING,
+    WIRE,
+    Loop,
+    gains_with,
+    measured,
+    turned,
+)
 from tests.support.plant_end import GAINS, record_of
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
@@ -194,6 +213,81 @@ def test_a_set_point_that_is_refused_is_counted_and_changes_nothing(streaming: L
     assert [len(text.splitlines()) for text in streaming.events("fault")] == [1]
     assert len(streaming.changes()) == len(before) + 1  # the good one that came before it
     assert streaming.yaw() == pytest.approx(3.0, abs=1e-12)
+
+
+def test_of_a_burst_of_set_points_one_is_checked_without_sampling_its_way(
+    streaming: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is near is known to keep the limits by the control points of its quintic; what is far, by samples."""
+    checked, sampled = list[Trajectory](), list[Trajectory]()
+    _counted(monkeypatch, "check", checked)
+    _counted(monkeypatch, "samples", sampled)
+    for n in range(100):
+        streaming.stream(yaw=0.01 * n)
+    streaming.tick()
+    assert [tuple(trajectory.first.angle[0]) for trajectory in checked] == [(0.0, 0.0, pytest.approx(radians(0.99)))]
+    assert sampled == []
+    streaming.stream(yaw=50.0)
+    streaming.tick()
+    assert len(checked) == 2
+    assert sampled
+
+
+def _counted(monkeypatch: pytest.MonkeyPatch, name: str, calls: list[Trajectory]) -> None:
+    method = getattr(Trajectory, name)
+
+    def counted(trajectory: Trajectory, *arguments: Any) -> Any:
+        calls.append(trajectory)
+        return method(trajectory, *arguments)
+
+    monkeypatch.setattr(Trajectory, name, counted)
+
+
+LONG = Points(times=[n / 10 for n in range(MAX_POINTS)], attitudes=[(0.0, n % 3, n % 2) for n in range(MAX_POINTS)])
+
+
+def test_ten_thousand_points_are_checked_before_the_loop_takes_them(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In their topic's thread, which is the one that calls the queryable: the loop evaluates two pieces at the most."""
+    checked, evaluated = list[Trajectory](), list[Trajectory]()
+    _counted(monkeypatch, "check", checked)
+    asked = loop.ask("track", Track(reference=LONG))
+    assert [len(trajectory.starts) for trajectory in checked] == [MAX_POINTS]
+    _counted(monkeypatch, "at", evaluated)
+    _counted(monkeypatch, "samples", evaluated)
+    loop.tick()
+    assert asked.answers[0].done
+    assert len(checked) == 1
+    assert max(len(trajectory.starts) for trajectory in evaluated) <= 2
+
+
+def test_a_record_is_shown_at_once_and_encoded_once_however_often_it_is_asked_for(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the thread of its topic, while the loop does something else."""
+    encoded = list[SessionRecord]()
+    encode, loops_thread = SessionRecord.encode, threading.get_ident()
+
+    def counted(record: SessionRecord) -> bytes:
+        assert threading.get_ident() != loops_thread
+        encoded.append(record)
+        return encode(record)
+
+    monkeypatch.setattr(SessionRecord, "encode", counted)
+
+    def shown() -> SessionRecord:
+        with ThreadPoolExecutor(1) as topic:
+            (payload,) = topic.submit(loop.ask, "show", Request()).result().replies
+        return SessionRecord.model_validate_json(payload)
+
+    first = loop.live.record
+    assert [shown() for _ in range(50)] == [first] * 50
+    assert encoded == [first]
+    assert loop.answered("track", Track(reference=yaw_of(3.0))).done
+    assert shown().reference == yaw_of(3.0)
+    assert shown().reference == yaw_of(3.0)
+    assert encoded == [first, loop.live.record]
 
 
 def test_silence_is_reported_once_and_the_last_set_point_held_until_there_is_another(streaming: Loop) -> None:
@@ -452,3 +546,18 @@ def test_configured_follows_the_configuration_at_first_and_then_what_the_last_se
     assert (loop.live.record.reference, loop.live.record.reference_from) == (TARGET, "operator")
     assert loop.controller.gains == GAINS
     loop.assert_it_runs_again()
+
+
+def test_a_body_found_beyond_its_limit_of_tilt_is_approached_all_the_same() -> None:
+    """Rolled by 120° and pitched by 85°, which is 92.5°, it passes 94° on its way to level."""
+    # Three actuators turn it about every axis.
+    wire = WireSpec(attitude=WIRE.attitude, rate=WIRE.rate, voltage=WIRE.voltage, actuators=3)
+    loop = Loop(LEVEL, ControllerSettings(after_restart="resume"), wire=wire)
+    loop.begin(record(LEVEL))
+    attitude = WIRE.attitude.quantizer()
+    found = [attitude.encode(x) for x in attitude_of(np.radians([120.0, 85.0, 0.0]))[1:]]
+    for _ in range(3):
+        loop.tick([*found, *AT_REST[3:]])
+    change = loop.changes()[-1]
+    assert change.start == pytest.approx((120.0, 85.0, 0.0), abs=1e-3)
+    assert change.reference == LEVEL

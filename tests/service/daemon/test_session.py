@@ -143,7 +143,7 @@ class Dawdling(Failing):
 @pytest.mark.parametrize(
     ("law", "cause", "valid", "invalid"),
     [
-        (f"{__name__}:Dawdling", "took 0.3 s for a tick", 2, 0),  # a command computed too late is not sent
+        (f"{__name__}:Dawdling", "took 0.3 s of CPU time for a tick", 2, 0),  # a command computed too late is not sent
         (f"{FAILING}:Failing", "RuntimeError: the estimator", 3, 1),
     ],
 )
@@ -151,12 +151,22 @@ def test_a_law_that_fails_or_takes_too_long_faults_the_controller_by_name(
     law: str, cause: str, valid: int, invalid: int
 ) -> None:
     stage = Stage(map(arrival, range(10)), f"law.kind={law}")
-    passing.append(lambda: stage.link.advance(0.3))
+    passing.append(lambda: stage.link.compute(0.3))
     assert not stage.run()
     assert stage.shared.machine.state is ControllerState.FAULTED
     assert f"law {law}" in stage.shared.cause
     assert cause in stage.shared.cause
     assert [any(map(isnan, volts)) for volts in stage.commands] == [False] * valid + [True] * invalid
+
+
+def test_a_law_that_the_host_halts_in_a_tick_goes_on_and_is_no_fault() -> None:
+    """As by SIGSTOP: time passes, but none of it on a CPU. The plant's watchdog judges the lateness."""
+    stage = Stage(map(arrival, range(300)), f"law.kind={__name__}:Dawdling", "law.at=1000", "controller.duration_s=0.5")
+    passing.append(lambda: stage.link.advance(0.13))
+    assert stage.run()
+    assert stage.shared.machine.state is ControllerState.RUNNING
+    assert stage.rows[:3] == [(k, Sent.FRAME) for k in range(3)]
+    assert stage.rows[3][0] > 3 + 0.12 / 0.002  # what came meanwhile is missed, but for the newest
 
 
 @pytest.mark.parametrize(
@@ -179,6 +189,24 @@ def claims_of(zenoh: Any, **role: Any) -> ClaimClient:
     known = {"vehicle": "aero", "name": "c", "datagrams": SimpleNamespace(wanted=False)}
     node = cast(Node, SimpleNamespace(zenoh=zenoh, **known | role))
     return ClaimClient(node, LoopSettings(), WireSpec(), auto_arm=False)
+
+
+def test_a_record_is_encoded_once_however_often_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded, sent = list[SessionRecord](), list[bytes]()
+    encode = SessionRecord.encode
+
+    def counted(record: SessionRecord) -> bytes:
+        encoded.append(record)
+        return encode(record)
+
+    monkeypatch.setattr(SessionRecord, "encode", counted)
+    claims = claims_of(SimpleNamespace(get=lambda *_, payload, **__: sent.append(payload)))
+    claims.session = "s"
+    first, second = record_of("c"), record_of("c", within_s=5.0)
+    for record in (first, first, first, second, second):
+        claims.keep(record)
+    assert [SessionRecord.model_validate_json(payload) for payload in sent] == [first] * 3 + [second] * 2
+    assert encoded == [first, second]
 
 
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:

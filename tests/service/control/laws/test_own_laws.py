@@ -195,6 +195,15 @@ def test_helpers_of_a_law_give_arrays_for_numbers_and_expressions_for_expression
             assert helper(argument) == pytest.approx(expected, rel=1e-12)  # of B: another way to solve
 
 
+def test_a_law_that_fails_keeps_the_state_that_it_had() -> None:
+    """That of a log it continues, even at the first tick."""
+    one = controller(f"{FAILING}:Failing", "law.failure=raises", "law.at=7")
+    one.restore(one.state.model_copy(update={"law": {"ticks": (7.0,)}}))
+    one.tick(measurement(CONTINUOUS, 0, *[0.0] * 6), 0)
+    assert one.fault is not None
+    assert one.law_state == {"ticks": (7.0,)}
+
+
 WHY = {
     "raises": f"law {FAILING}:Failing: RuntimeError: the estimator diverged (failing_laws.py, line {{line}})",
     "gives NaN": f"law {FAILING}:Failing gave no number (failing_laws.py, line {{step}})",
