@@ -99,7 +99,7 @@ def zenoh_config(
     if certificate is not None:
         config["transport"]["link"]["tls"] = tls_config(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
-        protocols = {Endpoint.parse(each).protocol for each in settings.endpoints}
+        protocols = {Endpoint.parse(each).protocol for each in [*settings.endpoints, *listen, *connect]}
         config["transport"]["link"]["protocols"] = sorted(protocols)
         config["access_control"] = access_control(*vehicles, loopback=not protocols <= {*TLS})
     return config

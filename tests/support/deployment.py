@@ -44,10 +44,15 @@ class Outcome(NamedTuple):
 
 
 class Deployment(Hosts):
-    """Hosts of an example configuration with a certificate each; `daemons` by host, once started."""
+    """Hosts of an example configuration with a certificate each; `daemons` by host, once started.
 
-    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
-        super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")
+    `strangers` are further hosts, without a certificate.
+    """
+
+    def __init__(
+        self, kind: Kind, folder: Path, overrides: Sequence[str] = (), strangers: Sequence[str] = ()
+    ) -> None:
+        super().__init__((*HOSTS, *strangers), folder, EXAMPLES / f"hosts-{kind}.toml")
         self.kind = kind
         self.daemons: dict[str, Popen[bytes]] = {}
         self.log_file = folder / "log.mcap"
