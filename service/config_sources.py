@@ -165,8 +165,8 @@ def load_target(file: Path | None = None, overrides: Iterable[str] = (), warn: W
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
     Nothing else is read: a mistake in another section, or in its name, does not keep `op stop` from a plant, nor does
-    an unknown section or variable of the environment, of which `warn` is told. What may be meant as vehicle or network,
-    as `[netwrok]` is, is refused: a stop must not miss its plant.
+    an unknown section or variable of the environment: `warn` takes a line about each. What may be meant as vehicle or
+    network, as `[netwrok]` is, is refused: a stop must not miss its plant.
 
     Raises:
         ConfigError: A source cannot be read, or vehicle or network is wrong, or an unknown name is like one of theirs.

@@ -143,7 +143,7 @@ class Node:
         returns runs between ticks and returns the reply. A message that it returns is the reply, at once, and so is an
         AeroloopError from either. Both run in the context of the operator in the query's attachment, `ASKED_BY`.
 
-        With `by_datagrams` the session of the frames answers, too, if it listens by now: who floods the TCP ports
+        With `by_datagrams` the session of the frames answers, too, if it listens by now: a flood of TCP connections
         keeps no newcomer from it.
         """
         key = topics.key(topic, self.vehicle)

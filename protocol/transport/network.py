@@ -198,7 +198,8 @@ class FrameSession:
     declares: it would get lost with UDP as the first link of one session for all.
 
     The plant listens at the first free port of its host's endpoints, by UDP, and names the `endpoint` in its status.
-    The controller connects to it before it claims; without such a link its frames stay on the first session.
+    The controller connects to it before it claims; without such a link its frames stay on the first session. A plant
+    answers `stop` there, too: a flood of TCP connections keeps no operator from it.
     """
 
     LINK_S = 5.0  # how long claims wait for the link to a plant: a handshake takes 0.02 s, and up to 4 s at 20 % loss

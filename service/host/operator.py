@@ -37,7 +37,7 @@ from aeroloop.protocol.transport.network_settings import Endpoint, Identity, Net
 
 ANSWER_S: Final = 1.0
 STOP_S: Final = 10.0  # how long `stop` tries to reach every plant
-AGAIN_S: Final = 4 * COMMAND_S  # how long each try of `stop` but the first lasts
+AGAIN_S: Final = 4 * COMMAND_S  # the longest try of `stop`; each lasts twice as long as the one before
 FORWARD_AFTER_S: Final = 0.25  # how long a plant has to answer a stop before its controller is asked to pass it on
 _MAY_ACT: Final = "what was asked may still act"
 
@@ -150,7 +150,7 @@ def stop(
     """Stop a vehicle's plant, or every plant on the network. What fails is tried again until `patience_s` has passed.
 
     Each try has a session of its own, which links by TCP and, where plants take frames by datagrams, by QUIC at once:
-    who floods the ports of one carrier does not keep it from the other. `on_answer` is called with each plant's answer
+    a flood of one carrier's ports does not keep it from the other. `on_answer` is called with each plant's answer
     as it arrives. A process that does not answer is no failure where it is known to be no plant, nor once every plant
     that this process may reach has answered. Raises NetworkError where no router answers a client.
     """
@@ -169,7 +169,7 @@ def stop(
         except NoRouterError as error:
             if is_last or error.is_deserted:
                 raise
-        wait_s = AGAIN_S
+        wait_s = min(2 * wait_s, AGAIN_S)
 
 
 def stop_by(here: CommandSession, network: NetworkSettings, vehicle: str, known: Iterable[str] = ()) -> Stopped:

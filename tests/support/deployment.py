@@ -49,9 +49,7 @@ class Deployment(Hosts):
     `strangers` are further hosts, without a certificate.
     """
 
-    def __init__(
-        self, kind: Kind, folder: Path, overrides: Sequence[str] = (), strangers: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = (), strangers: Sequence[str] = ()) -> None:
         super().__init__((*HOSTS, *strangers), folder, EXAMPLES / f"hosts-{kind}.toml")
         self.kind = kind
         self.daemons: dict[str, Popen[bytes]] = {}

@@ -24,7 +24,14 @@ from tests.support.certified_link import tls
 
 HELD_S: Final = 0.05  # how long a connection of `tcp` stays open
 RETRY_MS: Final = 950  # pause of a session of `quic` after a refused handshake
+SETTLE_S: Final = 1.0
 AGAIN_S: Final = 0.5  # pause of `half-open` before it opens again what the other end has closed
+
+
+def _announce() -> None:
+    """Print that the flood has run for `SETTLE_S`."""
+    sys.stdout.write("flooding\n")
+    sys.stdout.flush()
 
 
 def _begin_connection(address: tuple[str, int]) -> socket.socket:
@@ -39,7 +46,11 @@ def connect_and_close(addresses: list[tuple[str, int]], per_s: float) -> None:
     """Open so many connections a second to each address, without a handshake."""
     open_connections: deque[tuple[float, socket.socket]] = deque()
     due = time.monotonic()
+    rounds = 0
     while True:
+        rounds += 1
+        if rounds == round(SETTLE_S * per_s):
+            _announce()
         for address in addresses:
             with suppress(OSError):
                 open_connections.append((time.monotonic(), _begin_connection(address)))
@@ -53,6 +64,8 @@ def connect_and_close(addresses: list[tuple[str, int]], per_s: float) -> None:
 def hold_open(addresses: list[tuple[str, int]], count: int) -> None:
     """Hold so many connections to each address open, without a handshake."""
     held = [(address, _begin_connection(address)) for address in addresses for _ in range(count)]
+    time.sleep(SETTLE_S)
+    _announce()
     while True:
         time.sleep(AGAIN_S)
         for i, (address, connection) in enumerate(held):
@@ -88,6 +101,8 @@ def shake_hands(endpoints: list[Endpoint], per_s: float, keys: Path) -> None:
             }
             for _ in range(round(per_s)):
                 stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(tree))))
+        time.sleep(SETTLE_S)
+        _announce()
         signal.pause()
 
 

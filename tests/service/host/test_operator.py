@@ -1,4 +1,4 @@
-"""Operator's queries to doubles of roles: a stop waits, tries again, and names who did not answer; so do other verbs."""
+"""Operator's queries to doubles of roles: a stop waits, tries again, and names who did not answer; other verbs, too."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.transport.network import command_session
+from aeroloop.protocol.transport.network import COMMAND_S, command_session
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import Settings
 from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.host import operator
 from aeroloop.service.host.operator import OperatorError, gather, send, stop, stop_by
-from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
+from tests.support.zenoh_network import PATIENCE_S, Gathering
 
 Reply = Callable[[], None]
 
@@ -88,7 +88,7 @@ def test_a_stop_waits_for_a_slow_plant_after_another_has_answered(monkeypatch: p
 
 
 def test_a_stop_tries_again_and_asks_only_the_plant_that_has_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operator, "AGAIN_S", operator.COMMAND_S)
+    monkeypatch.setattr(operator, "AGAIN_S", COMMAND_S)
 
     with Gathering() as gathering:
 
@@ -110,7 +110,7 @@ def test_a_plant_that_never_answers_is_named_and_the_others_answers_are_given() 
     with Gathering() as gathering:
         Plant(gathering, "prompt", promptly)
         Plant(gathering, "mute", never)
-        stopped = stop(gathering.settings, patience_s=2 * operator.COMMAND_S)
+        stopped = stop(gathering.settings, patience_s=2 * COMMAND_S)
     assert stopped.answers == [at_rest("prompt")]
     assert stopped.failures == ["the plant of mute does not answer: what was asked may still act"]
 
@@ -131,7 +131,7 @@ def test_a_stop_that_a_plant_refuses_is_a_failure() -> None:
         session = gathering.join()
         session.declare_queryable(key, lambda query: query.reply(key, refused.encode()), complete=True)
         token = session.liveliness().declare_token(topics.key("alive", "aero", role="plant"))
-        stopped = stop(gathering.settings, patience_s=2 * operator.COMMAND_S)
+        stopped = stop(gathering.settings, patience_s=2 * COMMAND_S)
         token.undeclare()
     assert stopped == ([], [refused.text])
 
@@ -190,7 +190,7 @@ def test_a_stop_goes_through_the_controller_where_no_plant_is_seen() -> None:
 
 def test_a_controller_without_a_plant_to_pass_a_stop_on_to_says_so() -> None:
     with Gathering() as gathering, controller(gathering.settings):
-        stopped = stop(gathering.settings, "aero", patience_s=2 * operator.COMMAND_S)
+        stopped = stop(gathering.settings, "aero", patience_s=2 * COMMAND_S)
         assert stopped.answers == []
         assert "no plant of aero answers at" in stopped.failures[0]
 
