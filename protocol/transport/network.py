@@ -90,7 +90,7 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     """Open a router's session, which passes on what its clients publish and query. Closing and errors as of `join`."""
     network = protected(settings, identity)
     _warn_of_plain(network)
-    config = router_config(network)
+    config = router_config(network, _free_datagram_endpoints(network.settings))
     try:
         return _open(config)
     except zenoh.ZError as error:
@@ -162,13 +162,14 @@ def command_session(
 ) -> Iterator[CommandSession]:
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
-    With `by_datagrams` it also links to the sessions of frames (`FrameSession`), where plants answer `stop`. Errors are
-    those of `join`, and NoRouterError if it is a client's and no router answers.
+    With `by_datagrams` it also links by QUIC, to the sessions of frames (`FrameSession`), where plants answer `stop`; a
+    client does so if no router answers by TLS. Errors are those of `join`, and NoRouterError if it is a client's and no
+    router answers.
     """
     wait_ms = round(wait_s * 1000)  # of one attempt to connect, as closing a session waits for a handshake in progress
     network = protected(settings, identity)
     meeting = network.settings.rendezvous_endpoints
-    if by_datagrams and network.settings.mixed:
+    if by_datagrams:
         meeting = [*meeting, *_datagram_endpoints(network.settings)]
     try:
         if patient and settings.mode == "client":
@@ -223,11 +224,10 @@ class FrameSession:
 
     def listen(self) -> None:
         """Listen at the first free one of this host's endpoints, if datagrams are wanted; `endpoint` then names it."""
-        for each in self._endpoints if self.wanted else []:
-            if Endpoint.parse(each).is_free:
-                with suppress(zenoh.ZError):  # taken in the meantime
-                    self.session, self.endpoint = self._open(listen=[each]), each
-                    return
+        for each in _free_datagram_endpoints(self._network.settings) if self.wanted else []:
+            with suppress(zenoh.ZError):  # taken in the meantime
+                self.session, self.endpoint = self._open(listen=[each]), each
+                return
 
     def connect(self, endpoint: str) -> bool | None:
         """Connect to a plant's endpoint; whether there is a link. None while that is not decided, for up to `LINK_S`.
@@ -261,8 +261,18 @@ class FrameSession:
         return _open(config)
 
 
+def _free_datagram_endpoints(settings: NetworkSettings) -> list[str]:
+    """Those endpoints of datagrams at which this process could listen."""
+    return [text for text in _datagram_endpoints(settings) if Endpoint.parse(text).is_free]
+
+
 def _datagram_endpoints(settings: NetworkSettings) -> list[str]:
-    """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback."""
+    """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback.
+
+    Empty with `transport = "tcp"`.
+    """
+    if settings.transport == "tcp":
+        return []
     carriers = {"tcp": "udp", "tls": "quic"}
     words = "?rel=1;mixed_rel=1"  # Zenoh's for a QUIC connection with a reliable stream and with datagrams
     beyond = [each for each in map(Endpoint.parse, settings.rendezvous_endpoints) if each.leaves_host]

@@ -9,6 +9,7 @@ name all vehicles in one key (`aeroloop/*/status/*`); what acts names its vehicl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from secrets import token_hex
 from typing import Any, Final, Literal
@@ -105,12 +106,15 @@ def zenoh_config(
     return config
 
 
-def router_config(network: Protected) -> dict[str, Any]:
-    """Zenoh's configuration of a router, which listens at this host's rendezvous and connects to the others."""
+def router_config(network: Protected, by_datagrams: Sequence[str] = ()) -> dict[str, Any]:
+    """Zenoh's configuration of a router, which listens at this host's rendezvous and connects to the others.
+
+    It also listens at the endpoints of QUIC in `by_datagrams`, for operators that a flooded port of TLS keeps out.
+    """
     rendezvous = network.settings.rendezvous
     here = [each for each in rendezvous if Endpoint.parse(each).is_own] or rendezvous
     others = [each for each in rendezvous if each not in here]
-    config = zenoh_config(network, "router", [*here, *network.settings.listen], others)
+    config = zenoh_config(network, "router", [*here, *network.settings.listen, *by_datagrams], others)
     config["scouting"]["delay"] = 0  # otherwise it takes 0.5 s to open, whatever is linked
     config["timestamping"] = {"enabled": False}  # a router stamps messages by default: 26 bytes that nothing reads
     config["adminspace"] = {"enabled": False, "permissions": {"read": False, "write": False}}

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.deployment import Kind
 from tests.support.flooded import FloodedDeployment
 from tests.support.namespaces import NoNamespacesError
 
@@ -38,18 +39,23 @@ def both_carriers_at_the_plant(hosts: FloodedDeployment) -> None:
     hosts.flood("quic", "50", roles=["plant"])
 
 
+def connections_at_the_router(hosts: FloodedDeployment) -> None:
+    hosts.flood("tcp", "50", roles=["router"])
+
+
 @pytest.mark.parametrize(
-    "flood",
+    ("kind", "flood"),
     [
-        connections_at_every_role,
-        half_open_ones_at_every_role,
-        both_carriers_behind_the_firewall,
-        both_carriers_at_the_plant,
+        ("peers", connections_at_every_role),
+        ("peers", half_open_ones_at_every_role),
+        ("peers", both_carriers_behind_the_firewall),
+        ("peers", both_carriers_at_the_plant),
+        ("router", connections_at_the_router),
     ],
 )
-def test_a_stop_gets_through_a_flood(flood: Callable[[FloodedDeployment], None], tmp_path: Path) -> None:
+def test_a_stop_gets_through_a_flood(kind: Kind, flood: Callable[[FloodedDeployment], None], tmp_path: Path) -> None:
     try:
-        with FloodedDeployment(tmp_path) as hosts:
+        with FloodedDeployment(tmp_path, kind) as hosts:
             hosts.start()
             flood(hosts)
             hosts.await_floods()

@@ -21,7 +21,6 @@ from tests.support.certificates import Authority
 from tests.support.certified_link import open_session
 from tests.support.zenoh_network import eventually
 
-
 PATIENT: Final = {"plant.watchdog_s": 10, "controller.stale_s": 10, "wire.counter_bits": 14}
 """The watchdog is not the matter here, and must not end a session on a machine that stalls for seconds."""
 

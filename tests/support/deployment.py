@@ -130,7 +130,7 @@ class Deployment(Hosts):
         self.daemons[host].wait(STOP_WAIT_S)
 
     def await_driven(self, since: float) -> None:
-        """Wait for a status of a driven plant that arrives after a time [s since 1970]; four processes may start first."""
+        """Wait for a status of a driven plant that arrives after a time [s since 1970]; processes may start first."""
 
         def is_driven() -> bool:
             return any(line.get("state") == "driven" and line["at"] > since for line in self._seen())

@@ -15,7 +15,7 @@ from aeroloop.protocol.transport.network import joined_session
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.host.operator import OperatorError, send_by
 from tests.support.certificates import Authority
-from tests.support.deployment import HOSTS, Deployment
+from tests.support.deployment import HOSTS, Deployment, Kind
 from tests.support.zenoh_network import eventually
 
 PATIENT: Final = (
@@ -39,10 +39,10 @@ class Try(NamedTuple):
 
 
 class FloodedDeployment(Deployment):
-    """Daemons of the example of peers, and a stranger's host, which has a certificate of another authority."""
+    """Daemons of an example, and a stranger's host, which has a certificate of another authority."""
 
-    def __init__(self, folder: Path, overrides: Sequence[str] = ()) -> None:
-        super().__init__("peers", folder, (*PATIENT, *overrides), strangers=("stranger",))
+    def __init__(self, folder: Path, kind: Kind = "peers") -> None:
+        super().__init__(kind, folder, PATIENT, strangers=("stranger",))
         self._foreign = Authority(folder / "foreign")
         self._foreign.issue("operator")
         self._floods: list[Path] = []
@@ -62,7 +62,7 @@ class FloodedDeployment(Deployment):
         super().__exit__(*exception)
 
     def flood(self, kind: str, count: str, roles: Sequence[str] = ROLES) -> None:
-        """Begin a flood, which lasts until the deployment ends."""
+        """Begin a flood of these roles' hosts, which lasts until the deployment ends."""
         place_by_role = dict(zip(HOSTS, self.rendezvous, strict=False))
         places = [place_by_role[role] for role in roles]
         words = ("-m", "tests.support.flood", kind, count, str(self._foreign.folder), *places)
@@ -115,8 +115,9 @@ class FloodedDeployment(Deployment):
 
 def _arm_on_request(network: NetworkSettings) -> None:
     """Arm the plant at every line of stdin, by a session that is linked from the start."""
+    least = len(ROLES) if network.mode == "peer" else 1
     with joined_session(network) as session:
-        eventually("links", lambda: len(session.session.info.peers_zid()) >= len(ROLES))
+        eventually("links", lambda: len(session.session.info.links()) >= least)
         sys.stdout.write("linked\n")
         sys.stdout.flush()
         for _ in sys.stdin:

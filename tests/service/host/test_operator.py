@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,12 +17,14 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.runtime.node import Node
-from aeroloop.protocol.transport.network import COMMAND_S, command_session
-from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.network import COMMAND_S, command_session, join
+from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings, SecuritySettings
 from aeroloop.service.config import Settings
 from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.host import operator
 from aeroloop.service.host.operator import OperatorError, gather, send, stop, stop_by
+from aeroloop.service.testing.process_group import free_rendezvous
+from tests.support.certificates import Authority
 from tests.support.zenoh_network import PATIENCE_S, Gathering
 
 Reply = Callable[[], None]
@@ -33,9 +37,9 @@ def at_rest(vehicle: str) -> str:
 class Plant:
     """A double of a vehicle's plant, with a token. `answer` is called with each stop's way to reply."""
 
-    def __init__(self, gathering: Gathering, vehicle: str, answer: Callable[[Reply], None]) -> None:
+    def __init__(self, session: zenoh.Session, vehicle: str, answer: Callable[[Reply], None]) -> None:
         self.asked = 0
-        self._session = gathering.join()
+        self._session = session
         self._answer = answer
         self._key = topics.key("stop", vehicle)
         self._text = at_rest(vehicle)
@@ -80,8 +84,8 @@ def test_a_stop_waits_for_a_slow_plant_after_another_has_answered(monkeypatch: p
         threading.Thread(target=reply_when_told).start()
 
     with Gathering() as gathering:
-        Plant(gathering, "prompt", promptly)
-        Plant(gathering, "slow", slowly)
+        Plant(gathering.join(), "prompt", promptly)
+        Plant(gathering.join(), "slow", slowly)
         stopped = stop(gathering.settings, patience_s=0, on_answer=on_answer)
     assert told == [at_rest("prompt"), at_rest("slow")]
     assert stopped == (told, [])
@@ -96,8 +100,8 @@ def test_a_stop_tries_again_and_asks_only_the_plant_that_has_not_answered(monkey
             if hesitant.asked > 1:
                 reply()
 
-        prompt = Plant(gathering, "prompt", promptly)
-        hesitant = Plant(gathering, "hesitant", answers_when_asked_again)
+        prompt = Plant(gathering.join(), "prompt", promptly)
+        hesitant = Plant(gathering.join(), "hesitant", answers_when_asked_again)
         stopped = stop(gathering.settings, patience_s=PATIENCE_S)
         assert hesitant.asked == 2
         assert prompt.asked == 1
@@ -108,8 +112,8 @@ def test_a_stop_tries_again_and_asks_only_the_plant_that_has_not_answered(monkey
 def test_a_plant_that_never_answers_is_named_and_the_others_answers_are_given() -> None:
     """After `COMMAND_S`, in which a plant is seen within milliseconds; a busy machine has the second try."""
     with Gathering() as gathering:
-        Plant(gathering, "prompt", promptly)
-        Plant(gathering, "mute", never)
+        Plant(gathering.join(), "prompt", promptly)
+        Plant(gathering.join(), "mute", never)
         stopped = stop(gathering.settings, patience_s=2 * COMMAND_S)
     assert stopped.answers == [at_rest("prompt")]
     assert stopped.failures == ["the plant of mute does not answer: what was asked may still act"]
@@ -117,10 +121,71 @@ def test_a_plant_that_never_answers_is_named_and_the_others_answers_are_given() 
 
 def test_a_stop_of_one_vehicle_waits_for_no_other() -> None:
     with Gathering() as gathering:
-        Plant(gathering, "prompt", promptly)
-        mute = Plant(gathering, "mute", never)
+        Plant(gathering.join(), "prompt", promptly)
+        mute = Plant(gathering.join(), "mute", never)
         assert stop(gathering.settings, "prompt") == ([at_rest("prompt")], [])
         assert mute.asked == 0
+
+
+def test_an_answer_that_arrives_twice_is_told_once() -> None:
+    """As by two carriers."""
+    told: list[str] = []
+    key = topics.key("stop", "aero")
+
+    def answer(query: zenoh.Query) -> None:
+        for _ in range(2):
+            query.reply(key, Answer(done=True, text=at_rest("aero")).encode())
+
+    with Gathering() as gathering:
+        session = gathering.join()
+        session.declare_queryable(key, answer, complete=True)
+        token = session.liveliness().declare_token(topics.key("alive", "aero", role="plant"))
+        assert stop(gathering.settings, on_answer=told.append) == ([at_rest("aero")], [])
+        token.undeclare()
+    assert told == [at_rest("aero")]
+
+
+@pytest.fixture
+def secured(tmp_path: Path) -> NetworkSettings:
+    """A network with certificates, of two vehicles."""
+    authority = Authority(tmp_path)
+    for role, vehicle in (("plant", "aero"), ("plant", "bero"), ("operator", None)):
+        authority.issue(role, vehicle)
+    security = SecuritySettings(directory=str(tmp_path), vehicles=["aero", "bero"])
+    return NetworkSettings(rendezvous=[free_rendezvous("tls")], security=security)
+
+
+def test_with_certificates_a_stop_is_done_once_the_plant_of_every_vehicle_has_answered(
+    secured: NetworkSettings,
+) -> None:
+    """Whatever else accepts connections and does not answer: it is no plant of a vehicle that has rights here."""
+    aero_is_told = threading.Event()
+
+    def when_aero_is_told(reply: Reply) -> None:
+        if aero_is_told.is_set():  # else it is asked again
+            reply()
+
+    with ExitStack() as stack:
+        aero = stack.enter_context(closing(join(secured, Identity(("plant",), "aero"))))
+        bero = stack.enter_context(closing(join(secured, Identity(("plant",), "bero"))))
+        place = Endpoint.parse(secured.rendezvous_endpoints[-1])
+        stack.enter_context(socket.create_server(place.address))
+        Plant(aero, "aero", promptly)
+        Plant(bero, "bero", when_aero_is_told)
+        stopped = stop(secured, patience_s=PATIENCE_S, on_answer=lambda _: aero_is_told.set())
+    assert stopped == ([at_rest("aero"), at_rest("bero")], [])
+
+
+def test_with_certificates_what_may_be_the_plant_of_a_vehicle_that_has_not_answered_is_named(
+    secured: NetworkSettings,
+) -> None:
+    places = [Endpoint.parse(text) for text in secured.rendezvous_endpoints]
+    with closing(join(secured, Identity(("plant",), "aero"))) as session, socket.create_server(places[-1].address):
+        Plant(session, "aero", promptly)
+        stopped = stop(secured, patience_s=2 * COMMAND_S)
+    assert stopped.answers == [at_rest("aero")]
+    (failure,) = stopped.failures
+    assert str(places[-1]) in failure
 
 
 def test_a_stop_that_a_plant_refuses_is_a_failure() -> None:
@@ -145,7 +210,7 @@ def test_where_nothing_listens_a_stop_does_not_wait() -> None:
 
 def test_a_console_s_session_asks_each_known_plant_at_once() -> None:
     with Gathering() as gathering:
-        plant = Plant(gathering, "aero", promptly)
+        plant = Plant(gathering.join(), "aero", promptly)
         with command_session(gathering.settings) as here:
             here.wait_for_links()
             assert stop_by(here, gathering.settings, "aero", known=["aero"]) == ([at_rest("aero")], [])
