@@ -281,6 +281,25 @@ def test_a_verb_that_reached_nobody_says_no_such_thing() -> None:
     assert "may still act" not in str(caught.value)
 
 
+@pytest.mark.parametrize("names", [("first", "second"), ("second", "first")])
+def test_of_several_controllers_the_status_of_the_one_with_the_session_is_gathered(names: tuple[str, str]) -> None:
+    """Whichever is met first: both orders are tried."""
+    key = topics.key("status", "aero", role="controller")
+    with Gathering() as gathering:
+        for name in names:
+            session = "s" if name == "first" else None
+            status = Status(
+                role="controller", state="running", session=session, uptime_s=1, ticks=1, rate_hz=0, skipped=0
+            )
+
+            def answer(query: zenoh.Query, content: bytes = status.encode()) -> None:
+                query.reply(key, content)
+
+            gathering.join().declare_queryable(key, answer, complete=True)
+        for _ in range(3):
+            assert gather(gathering.settings).statuses["aero"]["controller"].session == "s"
+
+
 def with_unknown_field(message: Any) -> bytes:
     return json.dumps({**json.loads(message.encode()), "of_a_newer_version": 1}).encode()
 
