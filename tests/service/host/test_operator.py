@@ -201,11 +201,19 @@ def test_a_stop_that_a_plant_refuses_is_a_failure() -> None:
     assert stopped == ([], [refused.text])
 
 
-def test_where_nothing_listens_a_stop_does_not_wait() -> None:
+def test_where_every_port_refuses_connections_a_stop_tries_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[float] = []
+
+    def counted(network: NetworkSettings, wait_s: float, *identity: Identity, by_datagrams: bool) -> Any:
+        tries.append(wait_s)
+        return command_session(network, wait_s, *identity, by_datagrams=by_datagrams)
+
+    monkeypatch.setattr(operator, "command_session", counted)
     with Gathering() as gathering:
-        stopped = stop(gathering.settings, patience_s=float("inf"))
+        stopped = stop(gathering.settings, patience_s=4 * COMMAND_S)
     assert stopped.answers == []
     assert "no plant answers" in stopped.failures[0]
+    assert tries == [COMMAND_S]
 
 
 def test_a_console_s_session_asks_each_known_plant_at_once() -> None:
