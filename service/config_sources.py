@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tomllib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
@@ -18,6 +19,8 @@ from aeroloop.protocol.errors import ConfigError as ConfigError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wording import closest, keys, problems
+
+log: Final = logging.getLogger("aeroloop")
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -57,16 +60,26 @@ class Target(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         return self
 
 
+Warn = Callable[[str], object]
+"""Takes one line about what is left unread."""
+
+
 def read_sources(
-    file: Path | None, overrides: Iterable[str], known: Collection[str], unread: Collection[str] = ()
+    file: Path | None,
+    overrides: Iterable[str],
+    known: Collection[str],
+    unread: Collection[str] = (),
+    warn: Warn | None = None,
 ) -> dict[str, Any]:
     """The tree of all sources; `known` are the keys that there are, but for those of the sections `unread`.
+
+    With `warn`, a variable of the environment that is like no key that there is only gets a warning.
 
     Raises:
         ConfigError: A source cannot be read, or a variable of the environment is no key.
     """
     tree = _file(file) if file is not None else {}
-    for words in (_environment(known, unread), overrides):
+    for words in (_environment(known, unread, warn), overrides):
         tree = merged(tree, tree_of(words))
     return tree
 
@@ -86,7 +99,7 @@ def _file(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _environment(known: Collection[str], unread: Collection[str]) -> Iterator[str]:
+def _environment(known: Collection[str], unread: Collection[str], warn: Warn | None) -> Iterator[str]:
     """Variables of the environment as words of `--set`, each key as its model writes it. Raises ConfigError."""
     written = {key.upper(): key for key in known}
     for name, text in os.environ.items():
@@ -101,8 +114,18 @@ def _environment(known: Collection[str], unread: Collection[str]) -> Iterator[st
                 near = closest(key, known)
                 variable = ENV_PREFIX + (near or "").upper().replace(".", "__")
                 hint = f"did you mean {variable}?" if near else "unset it, or see `aeroloop show config`"
-                raise ConfigError(f"{name} in the environment is no setting: {hint}")
+                problem = f"{name} in the environment is no setting: {hint}"
+                if warn is None or section or _may_be_meant_as(key, known):
+                    raise ConfigError(problem)
+                warn(problem)
+                continue
         yield f"{key}={text}"
+
+
+def _may_be_meant_as(name: str, known: Collection[str]) -> bool:
+    """Whether an unknown name is like one of the known keys, or is the last part of one: `rendezvous`."""
+    last_parts = {key.rpartition(".")[2].lower() for key in known}
+    return closest(name, known) is not None or name.lower() in last_parts
 
 
 def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
@@ -138,18 +161,26 @@ def merged(weaker: dict[str, Any], stronger: dict[str, Any], *, one_source: bool
     return tree
 
 
-def load_target(file: Path | None = None, overrides: Iterable[str] = ()) -> Target:
+def load_target(file: Path | None = None, overrides: Iterable[str] = (), warn: Warn = log.warning) -> Target:
     """Vehicle and network of a configuration; arguments as of `config.load`.
 
-    Nothing else is read: a mistake in another section, or in its name, does not keep `op stop` from a plant. An unknown
-    section is refused if it may be meant as vehicle or network, as `[netwrok]` is: a stop must not miss its plant.
+    Nothing else is read: a mistake in another section, or in its name, does not keep `op stop` from a plant, nor does
+    an unknown section or variable of the environment: `warn` takes a line about each. What may be meant as vehicle or
+    network, as `[netwrok]` is, is refused: a stop must not miss its plant.
 
     Raises:
-        ConfigError: A source cannot be read, a section is like none of the others, or vehicle or network is wrong.
+        ConfigError: A source cannot be read, or vehicle or network is wrong, or an unknown name is like one of theirs.
     """
-    tree = read_sources(file, overrides, keys(Target), OTHER_SECTIONS)
+    known = keys(Target)
     sections = (*Target.model_fields, *OTHER_SECTIONS)
-    return valid(Target, {name: each for name, each in tree.items() if closest(name, sections) not in OTHER_SECTIONS})
+    read: dict[str, Any] = {}
+    for name, content in read_sources(file, overrides, known, OTHER_SECTIONS, warn).items():
+        section = closest(name, sections)
+        if section in Target.model_fields or _may_be_meant_as(name, known):
+            read[name] = content
+        elif section is None:
+            warn(f"{name} in the configuration is no setting, and is left unread")
+    return valid(Target, read)
 
 
 def valid(

@@ -101,18 +101,19 @@ class ZenohNetwork(PlantNetwork):
     def serve(self) -> None:
         role = self._role
         role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
+        if not self._loop.lockstep:
+            role.datagrams.listen()
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
         role.serve("record", SessionRecord, self._keep_record)
         role.serve("show", Request, lambda _: self._last_record())
         role.serve("arm", Request, lambda _: self._once_kept(self._arm))
-        role.serve("stop", Request, lambda _: self._once_kept(self._stop))
+        role.serve("stop", Request, lambda _: self._once_kept(self._stop), by_datagrams=True)
+        role.serve("forwarded_stop", Request, lambda _: self._once_kept(self._stop))
         role.serve("mark", Mark, lambda mark: lambda: self._mark(mark.text))
         if self._computed:
             role.serve("inject", Inject, lambda request: lambda: self._inject(request))
             role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        if not self._loop.lockstep:
-            role.datagrams.listen()
         self._others = role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role=role.role), RingChannel(1), allowed_origin=zenoh.Locality.REMOTE
         )

@@ -84,6 +84,8 @@ TOPICS: Final = {
         Topic("record", "record", "query", _CONTROLLER, _PLANT, SessionRecord, request=POINTS_BYTES),
         Topic("arm", "arm", "query", _OPERATOR, _PLANT),
         Topic("stop", "stop", "query", _OPERATOR, _PLANT),
+        Topic("forward_stop", "forward-stop", "query", _OPERATOR, _CONTROLLER),
+        Topic("forwarded_stop", "forwarded-stop", "query", _CONTROLLER, _PLANT),
         Topic("stand_down", "stand-down", "query", _OPERATOR, _CONTROLLER),
         Topic("recall", "recall", "query", _OPERATOR, _CONTROLLER),
         Topic("show", "show", "query", _READERS, _ENDS, limit=POINTS_BYTES),

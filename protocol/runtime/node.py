@@ -145,7 +145,14 @@ class Node:
 
     # ── requests ──
 
-    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message] | Message]) -> None:
+    def serve(
+        self,
+        topic: str,
+        model: type[M],
+        prepare: Callable[[M], Callable[[], Message] | Message],
+        *,
+        by_datagrams: bool = False,
+    ) -> None:
         """Answer a topic's queries between ticks: when the owner of the loop calls `take_inbox`.
 
         A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
@@ -154,6 +161,9 @@ class Node:
         returns runs between ticks and returns the reply. An AeroloopError from either is the reply. Both run in the
         context of the operator in the query's attachment, `ASKED_BY`. A message that `prepare` returns instead is the
         reply, sent at once; however often the same one is asked for, it is encoded once.
+
+        With `by_datagrams` the session of the frames answers, too, if it listens by now: a flood of TCP connections
+        keeps no newcomer from it.
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
@@ -191,6 +201,8 @@ class Node:
                 ASKED_BY.reset(asked)
 
         self.zenoh.declare_queryable(key, received, complete=True)
+        if by_datagrams and self.datagrams.session is not None:
+            self.datagrams.session.declare_queryable(key, received, complete=True)
 
     def _read(self, topic: str, model: type[M], payload: bytes) -> M:
         """Read a request. Raises MessageError."""
@@ -221,9 +233,15 @@ class Node:
     # ── liveliness ──
 
     def announce(self) -> None:
-        """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
+        """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations.
+
+        A plant that takes frames by datagrams is seen there, too, by an operator that no TCP port lets in.
+        """
         notify_systemd("READY=1")
-        self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
+        key = topics.key("alive", self.vehicle, role=self.name)
+        self._tokens = [self.zenoh.liveliness().declare_token(key)]
+        if self.datagrams.session is not None:
+            self._tokens.append(self.datagrams.session.liveliness().declare_token(key))
 
     def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
         """Call back when a node's liveliness token appears (True) and disappears, in a thread of its own.

@@ -14,7 +14,7 @@ import logging
 import socket
 import ssl
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -28,6 +28,7 @@ from aeroloop.protocol.transport.network_settings import (
     PORTS,
     READER,
     STREAMS,
+    TLS,
     Endpoint,
     Identity,
     NetworkError,
@@ -46,6 +47,15 @@ PLAIN_S: Final = 3.0  # the same for a peer of Zenoh without TLS, which hangs up
 POLL_S: Final = 0.005
 ROUTER_AGAIN_S: Final = 0.2  # pause before a client that finds no router looks again
 ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time without a router: it may have started first
+
+
+class NoRouterError(NetworkError):
+    """No router answers a command; one line. `is_deserted` is whether every router's endpoint refuses connections."""
+
+    def __init__(self, network: Protected) -> None:
+        probed = probe([*network.settings.connect, *network.settings.rendezvous])
+        super().__init__(_no_router(network, probed))
+        self.is_deserted = all(accepts is False for accepts in probed.values())
 
 
 def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
@@ -80,7 +90,7 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     """Open a router's session, which passes on what its clients publish and query. Closing and errors as of `join`."""
     network = protected(settings, identity)
     _warn_of_plain(network)
-    config = router_config(network)
+    config = router_config(network, _free_datagram_endpoints(network.settings))
     try:
         return _open(config)
     except zenoh.ZError as error:
@@ -90,17 +100,26 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
 
 
 class CommandSession:
-    """A command's session: it does not listen, and links to every process that answers. `certificate` is its own."""
+    """A command's session: it does not listen, and links to every process that answers. `certificate` is its own.
 
-    def __init__(self, session: zenoh.Session, endpoints: list[str], certificate: Certificate | None) -> None:
+    `vehicles` are all that it can reach, where every link needs a certificate; empty where that is unknown.
+    """
+
+    def __init__(self, session: zenoh.Session, network: Protected) -> None:
+        settings = network.settings
         self.session = session
-        self.certificate = certificate
-        self._endpoints = endpoints
-        self._accepting: list[str] | None = None
+        self.certificate = network.certificate
+        only_tls = all(Endpoint.parse(text).protocol in TLS for text in settings.endpoints)
+        self.vehicles = network.vehicles if only_tls else ()
+        self._network = network
+        self._endpoints: list[str] = []
+        if settings.mode == "peer":  # a client is linked from the start
+            self._endpoints = [*settings.connect, *settings.rendezvous_endpoints]
+        self._probed: dict[str, bool | None] | None = None
 
     def anew(self) -> CommandSession:
         """The same session, for another command: which endpoints accept connections is found out again."""
-        return CommandSession(self.session, self._endpoints, self.certificate)
+        return CommandSession(self.session, self._network)
 
     def wait_for_links(self, wait_s: float = COMMAND_S) -> None:
         """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
@@ -113,9 +132,18 @@ class CommandSession:
 
         Each without a link is tried once: after a try Zenoh's listener of TLS accepts no connection for 0.1 s.
         """
-        if self._accepting is None:
-            self._accepting = accepting(self._unlinked(self._endpoints))
-        return self._unlinked(self._accepting)
+        if self._probed is None:
+            self._probed = probe(self._unlinked(self._endpoints))
+        return self._unlinked([text for text, accepts in self._probed.items() if accepts])
+
+    @property
+    def is_deserted(self) -> bool:
+        """Whether there is no process to wait for: there is no link, and every endpoint refuses connections.
+
+        False before `unanswered` has tried them.
+        """
+        is_refused = self._probed is not None and all(accepts is False for accepts in self._probed.values())
+        return is_refused and not self.session.info.links()
 
     def _unlinked(self, endpoints: list[str]) -> list[str]:
         """Those of some endpoints without a link of this session's own; one that the peer has made is none."""
@@ -125,15 +153,24 @@ class CommandSession:
 
 @contextmanager
 def command_session(
-    settings: NetworkSettings, wait_s: float = COMMAND_S, identity: Identity = READER, *, patient: bool = False
+    settings: NetworkSettings,
+    wait_s: float = COMMAND_S,
+    identity: Identity = READER,
+    *,
+    patient: bool = False,
+    by_datagrams: bool = False,
 ) -> Iterator[CommandSession]:
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
-    Errors are those of `join`, and NetworkError if it is a client's and no router answers.
+    With `by_datagrams` it also links by QUIC, to the sessions of frames (`FrameSession`), where plants answer `stop`; a
+    client does so if no router answers by TLS. Errors are those of `join`, and NoRouterError if it is a client's and no
+    router answers.
     """
     wait_ms = round(wait_s * 1000)  # of one attempt to connect, as closing a session waits for a handshake in progress
     network = protected(settings, identity)
     meeting = network.settings.rendezvous_endpoints
+    if by_datagrams:
+        meeting = [*meeting, *_datagram_endpoints(network.settings)]
     try:
         if patient and settings.mode == "client":
             session = _join_router(network)
@@ -141,10 +178,9 @@ def command_session(
             retry_ms = (2 * wait_ms, 2 * wait_ms)
             session = _open(zenoh_config(network, settings.mode, [], meeting, wait_ms * 4 // 5, retry_ms))
     except zenoh.ZError:
-        raise NetworkError(_no_router(network)) from None
-    with closing(session):  # a client is linked from the start
-        met = [*network.settings.connect, *meeting] if settings.mode == "peer" else []
-        yield CommandSession(session, met, network.certificate)
+        raise NoRouterError(network) from None
+    with closing(session):
+        yield CommandSession(session, network)
 
 
 @contextmanager
@@ -152,8 +188,7 @@ def joined_session(settings: NetworkSettings, identity: Identity = READER) -> It
     """A session as of `join`, for as long as its owner lives, that does not listen and sends commands, too."""
     network = protected(settings, identity)
     with closing(join(settings, identity, listen=False)) as session:
-        met = [*network.settings.connect, *network.settings.rendezvous_endpoints] if settings.mode == "peer" else []
-        yield CommandSession(session, met, network.certificate)
+        yield CommandSession(session, network)
 
 
 class FrameSession:
@@ -164,7 +199,8 @@ class FrameSession:
     declares: it would get lost with UDP as the first link of one session for all.
 
     The plant listens at the first free port of its host's endpoints, by UDP, and names the `endpoint` in its status.
-    The controller connects to it before it claims; without such a link its frames stay on the first session.
+    The controller connects to it before it claims; without such a link its frames stay on the first session. A plant
+    answers `stop` there, too: a flood of TCP connections keeps no operator from it.
     """
 
     LINK_S = 5.0  # how long claims wait for the link to a plant: a handshake takes 0.02 s, and up to 4 s at 20 % loss
@@ -188,11 +224,10 @@ class FrameSession:
 
     def listen(self) -> None:
         """Listen at the first free one of this host's endpoints, if datagrams are wanted; `endpoint` then names it."""
-        for each in self._endpoints if self.wanted else []:
-            if Endpoint.parse(each).is_free:
-                with suppress(zenoh.ZError):  # taken in the meantime
-                    self.session, self.endpoint = self._open(listen=[each]), each
-                    return
+        for each in _free_datagram_endpoints(self._network.settings) if self.wanted else []:
+            with suppress(zenoh.ZError):  # taken in the meantime
+                self.session, self.endpoint = self._open(listen=[each]), each
+                return
 
     def connect(self, endpoint: str) -> bool | None:
         """Connect to a plant's endpoint; whether there is a link. None while that is not decided, for up to `LINK_S`.
@@ -226,8 +261,18 @@ class FrameSession:
         return _open(config)
 
 
+def _free_datagram_endpoints(settings: NetworkSettings) -> list[str]:
+    """Those endpoints of datagrams at which this process could listen."""
+    return [text for text in _datagram_endpoints(settings) if Endpoint.parse(text).is_free]
+
+
 def _datagram_endpoints(settings: NetworkSettings) -> list[str]:
-    """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback."""
+    """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback.
+
+    Empty with `transport = "tcp"`.
+    """
+    if settings.transport == "tcp":
+        return []
     carriers = {"tcp": "udp", "tls": "quic"}
     words = "?rel=1;mixed_rel=1"  # Zenoh's for a QUIC connection with a reliable stream and with datagrams
     beyond = [each for each in map(Endpoint.parse, settings.rendezvous_endpoints) if each.leaves_host]
@@ -243,18 +288,18 @@ def _join_router(network: Protected) -> zenoh.Session:
         with suppress(zenoh.ZError):
             return _open(zenoh_config(network, "client", [], network.settings.rendezvous))
         if time.monotonic() > warn_at:
-            log.warning("waiting for a router: %s", _no_router(network))
+            log.warning("waiting for a router: %s", NoRouterError(network))
             warn_at = inf
         time.sleep(ROUTER_AGAIN_S)
 
 
-def _no_router(network: Protected) -> str:
-    """One line about routers that do not answer."""
-    routers = [*network.settings.connect, *network.settings.rendezvous]
-    for each in accepting(routers):
-        why = refusal(each, network.certificate) if network.certificate else None
-        return why or f"a process at {each} accepts connections and does not answer as a router"
-    return f"no router answers at {', '.join(routers)}; is `aeroloop router` running?"
+def _no_router(network: Protected, probed: Mapping[str, bool | None]) -> str:
+    """One line about routers that do not answer, which were probed."""
+    for text, accepts in probed.items():
+        if accepts:
+            why = refusal(text, network.certificate) if network.certificate else None
+            return why or f"a process at {text} accepts connections and does not answer as a router"
+    return f"no router answers at {', '.join(probed)}; is `aeroloop router` running?"
 
 
 def _warn_of_plain(network: Protected) -> None:
@@ -275,17 +320,29 @@ def _reason(error: Exception) -> str:
 
 def accepting(endpoints: Sequence[str]) -> list[str]:
     """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
+    return [text for text, accepts in probe(endpoints).items() if accepts]
 
-    def accepts(text: str) -> bool:
+
+def probe(endpoints: Sequence[str]) -> dict[str, bool | None]:
+    """For each endpoint whether a process accepts connections there; waits briefly.
+
+    False is a host's word that no process listens; None is no answer, or an endpoint of neither TCP nor TLS.
+    """
+
+    def accepts(text: str) -> bool | None:
         endpoint = Endpoint.parse(text)
         if endpoint.protocol in STREAMS and endpoint.port is not None:
-            with suppress(OSError), socket.create_connection(endpoint.address, ACCEPT_S):
-                return True
-        return False
+            try:
+                socket.create_connection(endpoint.address, ACCEPT_S).close()
+            except ConnectionRefusedError:
+                return False
+            except OSError:
+                return None
+            return True
+        return None
 
     with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
-        found = pool.map(accepts, endpoints)
-        return [text for text, accepted in zip(endpoints, found, strict=True) if accepted]
+        return dict(zip(endpoints, pool.map(accepts, endpoints), strict=True))
 
 
 def refusal(text: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -> str | None:

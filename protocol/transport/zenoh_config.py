@@ -9,6 +9,7 @@ name all vehicles in one key (`aeroloop/*/status/*`); what acts names its vehicl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from secrets import token_hex
 from typing import Any, Final, Literal
@@ -99,18 +100,21 @@ def zenoh_config(
     if certificate is not None:
         config["transport"]["link"]["tls"] = tls_config(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
-        protocols = {Endpoint.parse(each).protocol for each in settings.endpoints}
+        protocols = {Endpoint.parse(each).protocol for each in [*settings.endpoints, *listen, *connect]}
         config["transport"]["link"]["protocols"] = sorted(protocols)
         config["access_control"] = access_control(*vehicles, loopback=not protocols <= {*TLS})
     return config
 
 
-def router_config(network: Protected) -> dict[str, Any]:
-    """Zenoh's configuration of a router, which listens at this host's rendezvous and connects to the others."""
+def router_config(network: Protected, by_datagrams: Sequence[str] = ()) -> dict[str, Any]:
+    """Zenoh's configuration of a router, which listens at this host's rendezvous and connects to the others.
+
+    It also listens at the endpoints of QUIC in `by_datagrams`, for operators that a flooded port of TLS keeps out.
+    """
     rendezvous = network.settings.rendezvous
     here = [each for each in rendezvous if Endpoint.parse(each).is_own] or rendezvous
     others = [each for each in rendezvous if each not in here]
-    config = zenoh_config(network, "router", [*here, *network.settings.listen], others)
+    config = zenoh_config(network, "router", [*here, *network.settings.listen, *by_datagrams], others)
     config["scouting"]["delay"] = 0  # otherwise it takes 0.5 s to open, whatever is linked
     config["timestamping"] = {"enabled": False}  # a router stamps messages by default: 26 bytes that nothing reads
     config["adminspace"] = {"enabled": False, "permissions": {"read": False, "write": False}}

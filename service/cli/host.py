@@ -56,6 +56,9 @@ def units(
     if install is None:
         for name in units.units_of(source.settings):
             typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
+        rules = units.firewall(source.settings.network)
+        if rules:
+            typer.echo(f"# {units.FIREWALL}\n{rules}")
     else:
         for path in units.install(install, source):
             typer.echo(path)

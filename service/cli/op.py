@@ -34,7 +34,7 @@ def _target(config: Path | None, overrides: Sequence[str] | None) -> tuple[Targe
     """Network of the configuration, and the vehicle if one is configured."""
     from aeroloop.service.config_sources import load_target
 
-    target = load_target(config, overrides or ())
+    target = load_target(config, overrides or (), report)
     return target, target.vehicle if "vehicle" in target.model_fields_set else None
 
 
@@ -133,9 +133,7 @@ def stop(
     target, vehicle = _target(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
-    answers, failures = stop_plants(target.network, None if every else vehicle)
-    for line in answers:
-        typer.echo(line)
+    _, failures = stop_plants(target.network, None if every else vehicle, on_answer=typer.echo)
     if failures:
         fail("; ".join(failures), 1)
 

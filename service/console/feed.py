@@ -21,6 +21,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry
+from aeroloop.protocol.messages.operator import MessageError
 from aeroloop.protocol.messages.trace import NEVER, Batch, Outcome, Sent, read_batch
 from aeroloop.protocol.wire.attitude import IDENTITY, angle, received_quaternion, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
@@ -208,13 +209,13 @@ class Feed:
         address = topics.read_key(key)
         if address is None or address.topic.name not in SHOWN:
             return
-        with self.lock, suppress(ValidationError, ValueError, KeyError):
+        with self.lock, suppress(ValidationError, MessageError, ValueError, KeyError):
             vehicle = self.vehicles.setdefault(address.vehicle, Vehicle(address.vehicle))
             match address.topic.name:
                 case "description":
                     vehicle.describe(Description.model_validate_json(payload))
                 case "status":
-                    status, role = Status.model_validate_json(payload), address.role or ""
+                    status, role = Status.decode(payload, extra="ignore"), address.role or ""
                     at, last = vehicle.statuses.get(role, (now_s, status))
                     if replaces(status, last, now_s - at):
                         vehicle.statuses[role] = now_s, status

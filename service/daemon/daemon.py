@@ -6,19 +6,21 @@ status is published once a second, and with every change of state, gains or refe
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final, Literal
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Request, in_words
+from aeroloop.protocol.messages.operator import Answer, MessageError, Request, in_words
 from aeroloop.protocol.messages.states import ControllerState as State
 from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
 from aeroloop.protocol.messages.trace import batches_per_s
-from aeroloop.protocol.runtime.node import Node, RecorderWatch
+from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
-from aeroloop.service.daemon.claim import SessionLostError
+from aeroloop.service.daemon.claim import ANSWER_WAIT_S, SessionLostError
 from aeroloop.service.daemon.session import TELEMETRY_HZ, Session, Shared
 
 STATUS_PERIOD_S: Final = 1.0
@@ -49,6 +51,7 @@ class Daemon:
         self._shared.changes.serve()
         role.serve("stand_down", Request, lambda _: self._stand_down)
         role.serve("recall", Request, lambda _: self._recall)
+        role.serve("forward_stop", Request, self._forward_stop)
         self._recorder = RecorderWatch(role)
         role.watch_token("plant", self._shared.plant.see)
         role.announce()
@@ -121,6 +124,21 @@ class Daemon:
             return Answer(done=False, text=f"{self._role.name} is {self._shared.machine.state}")
         self._shared.machine.fire(Trigger.RECALL)
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
+
+    def _forward_stop(self, request: Request) -> Answer:
+        """Pass an operator's stop on to the plant, which no new link of the operator's own may reach.
+
+        Waits for the answer in the topic's thread, not in the loop. Only operators may ask for it, by the access rules.
+        """
+        key, vehicle = topics.key("forwarded_stop", self._role.vehicle), self._role.vehicle
+        answer = Answer(done=False, text=f"no plant of {vehicle} answers {self._role.name}")
+        for reply in self._role.zenoh.get(
+            key, payload=request.encode(), attachment=ASKED_BY.get(), timeout=ANSWER_WAIT_S
+        ):
+            with suppress(MessageError):
+                if reply.ok is not None:
+                    answer = Answer.decode(reply.ok.payload.to_bytes(), extra="ignore")
+        return answer
 
     # ── status ──
 

@@ -10,24 +10,36 @@ import getpass
 import os
 import socket
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import zenoh
-from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.operator import Answer, Message, Request
+from aeroloop.protocol.messages.operator import Answer, Message, MessageError, Request
 from aeroloop.protocol.runtime.host import listener
 from aeroloop.protocol.runtime.node import ASKER_LENGTH
 from aeroloop.protocol.transport.certificate import Certificate
-from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session, refusal
+from aeroloop.protocol.transport.network import (
+    COMMAND_S,
+    DECLARED_S,
+    POLL_S,
+    CommandSession,
+    NoRouterError,
+    command_session,
+    refusal,
+)
 from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings
 
 ANSWER_S: Final = 1.0
+STOP_S: Final = 10.0  # how long `stop` tries to reach every plant
+AGAIN_S: Final = 4 * COMMAND_S  # the longest try of `stop`; each lasts twice as long as the one before
+FORWARD_AFTER_S: Final = 0.25  # how long a plant has to answer a stop before its controller is asked to pass it on
+_MAY_ACT: Final = "what was asked may still act"
 
 
 class OperatorError(AeroloopError):
@@ -50,8 +62,9 @@ def gather(network: NetworkSettings) -> Gathered:
     with command_session(network) as here:
         here.wait_for_links()
         for address, content in _replies(here.session, topics.key("status", "*"), b"", COMMAND_S):
-            with suppress(ValidationError):  # of another version
-                status, roles = Status.model_validate_json(content), statuses.setdefault(address.vehicle, {})
+            with suppress(MessageError):
+                status = Status.decode(content, extra="ignore")  # a newer version's has fields of its own
+                roles = statuses.setdefault(address.vehicle, {})
                 if address.role is not None and (address.role not in roles or status.session):
                     roles[address.role] = status
         silent = _unanswered(here)
@@ -89,26 +102,36 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
 
 def send_by(here: CommandSession, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
     """As `send`, by a session that is open."""
-
-    def ask(topic: str, message: Message) -> list[Answer]:
-        key, asker = topics.key(topic, vehicle), _user(here.certificate)
-        replies = _replies(here.session, key, message.encode(), ANSWER_S, asker)
-        return [Answer.model_validate_json(content) for _, content in replies]
-
-    answers: list[Answer] = []
+    role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
     deadline = time.monotonic() + ANSWER_S
-    while not answers and time.monotonic() < deadline:
-        answers = ask(topic, message)
+    answers, timed_out = _ask(here, vehicle, topic, message)
+    while not answers and not timed_out and time.monotonic() < deadline:  # it was asked of nobody: no link yet
         time.sleep(POLL_S)
+        answers, timed_out = _ask(here, vehicle, topic, message)
+    if not answers and timed_out:
+        raise OperatorError(f"the {role} of {vehicle} did not answer within {ANSWER_S:g} s: {_MAY_ACT}")
     if not answers:
-        role = {"arm": "plant", "mark": "plant", "inject": "emulator"}.get(topic, "controller")
         raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
     done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
     if not done:
         raise OperatorError("; ".join(answer.text for answer in answers))
     if topic == "arm":
-        done += [answer.text for answer in ask("recall", Request()) if answer.done]
+        recalled, timed_out = _ask(here, vehicle, "recall", Request())
+        done += [answer.text for answer in recalled if answer.done]
+        if timed_out:
+            done.append(f"a controller of {vehicle} did not answer within {ANSWER_S:g} s: its recall may still act")
     return "; ".join(done)
+
+
+def _ask(here: CommandSession, vehicle: str, topic: str, message: Message) -> tuple[list[Answer], bool]:
+    """Answers to a request, and whether a role that it was sent to did not answer in time."""
+    key, asker = topics.key(topic, vehicle), _user(here.certificate)
+    replies = list(here.session.get(key, payload=message.encode(), attachment=asker, timeout=ANSWER_S, **_ALL))
+    answers: list[Answer] = []
+    for _, content in _good(replies):
+        with suppress(MessageError):
+            answers.append(Answer.decode(content, extra="ignore"))
+    return answers, any(reply.err is not None for reply in replies)
 
 
 class Stopped(NamedTuple):
@@ -118,63 +141,158 @@ class Stopped(NamedTuple):
     failures: list[str]
 
 
-def stop(network: NetworkSettings, vehicle: str | None = None) -> Stopped:
-    """Stop a vehicle's plant, or every plant on the network. What fails at first is tried once more, for longer.
-
-    A process that does not answer is no failure where it is known to be no plant.
-    """
-    outcome = _stop(network, vehicle or "*", COMMAND_S)
-    return _stop(network, vehicle or "*", 4 * COMMAND_S) if outcome.failures else outcome
-
-
-def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
-    identity = Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
-    with command_session(network, wait_s, identity) as here:
-        return stop_by(here, network, vehicle, wait_s)
-
-
-def stop_by(
-    here: CommandSession, network: NetworkSettings, vehicle: str, wait_s: float = COMMAND_S, known: Iterable[str] = ()
+def stop(
+    network: NetworkSettings,
+    vehicle: str | None = None,
+    patience_s: float = STOP_S,
+    on_answer: Callable[[str], object] = lambda _: None,
 ) -> Stopped:
-    """Stop a vehicle's plant, or every plant (`*`), by a session that is open, waiting so long for their answers.
+    """Stop a vehicle's plant, or every plant on the network. What fails is tried again until `patience_s` has passed.
+
+    Each try has a session of its own, which links by TCP and, where plants take frames by datagrams, by QUIC at once:
+    a flood of one carrier's ports does not keep it from the other. `on_answer` is called with each plant's answer
+    as it arrives. A process that does not answer is no failure where it is known to be no plant, nor once every plant
+    that this process may reach has answered. Raises NetworkError where no router answers a client.
+    """
+    identity = Identity(topics.TOPICS["stop"].senders, vehicle)
+    deadline = time.monotonic() + patience_s
+    answers: dict[str, str] = {}
+    wait_s = COMMAND_S
+    while True:
+        is_last = time.monotonic() + wait_s >= deadline
+        try:
+            with command_session(network, wait_s, identity, by_datagrams=True) as here:
+                attempt = _StopAttempt(here, network, vehicle or "*", answers, on_answer)
+                failures = attempt.run(wait_s, find_reasons=is_last)
+                if is_last or not failures or here.is_deserted:
+                    return Stopped([*answers.values()], failures)
+        except NoRouterError as error:
+            if is_last or error.is_deserted:
+                raise
+        wait_s = min(2 * wait_s, AGAIN_S)
+
+
+def stop_by(here: CommandSession, network: NetworkSettings, vehicle: str, known: Iterable[str] = ()) -> Stopped:
+    """Stop a vehicle's plant, or every plant (`*`), by a session that is open: one try.
 
     Plants that are `known` are asked before any other is looked for.
     """
-    answers: dict[str, list[str]] = {}
-
-    def received(reply: zenoh.Reply) -> None:
-        for address, content in _good([reply]):
-            answers[address.vehicle].append(Answer.model_validate_json(content).text)
-
-    def ask(name: str) -> None:
-        if name not in answers:
-            answers[name] = []
-            payload, asker = Request().encode(), _user(here.certificate)
-            here.session.get(
-                topics.key("stop", name), received, payload=payload, attachment=asker, timeout=wait_s, **_ALL
-            )
-
+    answers: dict[str, str] = {}
+    attempt = _StopAttempt(here, network, vehicle, answers, lambda _: None)
     for name in known:
-        ask(name)
-    begun = time.monotonic()
-    while (passed := time.monotonic() - begun) < wait_s:
-        # A plant declares its token last, so one with a token answers.
-        for address in _alive(here.session, vehicle, role="plant"):
-            ask(address.vehicle)
-        if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
-            break
-        time.sleep(POLL_S)
-    unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > COMMAND_S)
-    alone = set[str]()
-    if network.mode == "client" and vehicle == "*":  # a router has forgotten a plant that hangs
-        controlled = {each.vehicle for each in _alive(here.session, "*") if (each.role or "").startswith("controller")}
-        alone = controlled - {*answers}
-    failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
-    failures += [f"{name} has a controller, and no plant of it answers" for name in sorted(alone)]
-    failures += unanswered
-    if not answers and not failures:
-        failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
-    return Stopped([text for texts in answers.values() for text in texts], failures)
+        attempt.ask(name)
+    failures = attempt.run(COMMAND_S, find_reasons=False)
+    return Stopped([*answers.values()], failures)
+
+
+class _StopAttempt:
+    """One try to stop a vehicle's plant, or every plant (`*`). Adds to `answers`, by vehicle, and asks no other.
+
+    Zenoh's threads put what plants answer into `_replied` and `_refusals`; all else is the caller's thread's.
+    """
+
+    def __init__(
+        self,
+        here: CommandSession,
+        network: NetworkSettings,
+        vehicle: str,
+        answers: dict[str, str],
+        on_answer: Callable[[str], object],
+    ) -> None:
+        self._here, self._network, self._vehicle = here, network, vehicle
+        self._answers = answers
+        self._on_answer = on_answer
+        self._wanted = here.vehicles if vehicle == "*" else (vehicle,)  # empty: nobody knows them all
+        self._asked: set[str] = set()  # vehicles whose plant was asked
+        self._forwarded: set[str] = set()  # vehicles whose controller was asked
+        self._controlled: set[str] = set()  # vehicles that have a controller
+        self._replied: deque[tuple[str, str]] = deque()  # vehicle and text of each stop that was done
+        self._refusals: dict[str, str] = {}  # text by vehicle
+
+    def ask(self, name: str) -> None:
+        """Ask a vehicle's plant to stop, unless it was asked or has answered."""
+        if name not in self._asked and name not in self._answers:
+            self._asked.add(name)
+            self._query("stop", name)
+
+    def run(self, wait_s: float, *, find_reasons: bool) -> list[str]:
+        """Ask every plant that is seen; a line about each that has not answered in `wait_s`, or may not have been seen.
+
+        `find_reasons`: also find out whether certificates are the reason, which takes a while.
+        """
+        here = self._here
+        begin_s = time.monotonic()
+        while (passed_s := time.monotonic() - begin_s) < wait_s:
+            self._look_for_plants()
+            if passed_s > FORWARD_AFTER_S:
+                self._ask_controllers()
+            self._take_replies()
+            if self._is_complete():
+                break
+            if passed_s > DECLARED_S and not self._pending() and not here.unanswered():
+                break
+            time.sleep(POLL_S)
+        self._take_replies()
+        return self._failures(find_reasons=find_reasons)
+
+    def _query(self, topic: str, name: str) -> None:
+        key, payload, asker = topics.key(topic, name), Request().encode(), _user(self._here.certificate)
+        self._here.session.get(key, self._received, payload=payload, attachment=asker, timeout=AGAIN_S, **_ALL)
+
+    def _received(self, reply: zenoh.Reply) -> None:
+        for address, content in _good([reply]):
+            with suppress(MessageError):
+                answer = Answer.decode(content, extra="ignore")
+                if answer.done:
+                    self._replied.append((address.vehicle, answer.text))
+                else:
+                    self._refusals[address.vehicle] = answer.text
+
+    def _look_for_plants(self) -> None:
+        """Ask the plants whose tokens are seen. A plant declares its token last, so one with a token answers."""
+        for address in _alive(self._here.session, self._vehicle):
+            role = address.role or ""
+            if role == "plant":
+                self.ask(address.vehicle)
+            elif role.startswith("controller"):
+                self._controlled.add(address.vehicle)
+
+    def _ask_controllers(self) -> None:
+        """Ask the controllers of plants that have not answered to pass the stop on: they have a link already."""
+        for name in self._controlled - self._forwarded - self._answers.keys():
+            self._forwarded.add(name)
+            self._query("forward_stop", name)
+
+    def _take_replies(self) -> None:
+        while self._replied:
+            name, text = self._replied.popleft()
+            if name not in self._answers:  # a plant may answer by each carrier
+                self._answers[name] = text
+                self._on_answer(text)
+
+    def _is_complete(self) -> bool:
+        """Whether every plant that there may be has answered."""
+        return bool(self._wanted) and all(name in self._answers for name in self._wanted)
+
+    def _pending(self) -> set[str]:
+        """Vehicles whose plant or controller may still answer."""
+        return (self._asked | self._controlled) - self._answers.keys() - self._refusals.keys()
+
+    def _failures(self, *, find_reasons: bool) -> list[str]:
+        if self._is_complete():
+            return []
+        failures: list[str] = []
+        for name in sorted(self._asked - self._answers.keys()):
+            refused = self._refusals.get(name)
+            failures.append(refused or f"the plant of {name} does not answer: {_MAY_ACT}")
+        if self._network.mode == "client" and self._vehicle == "*":  # a router has forgotten a plant that hangs
+            without_plant = sorted(self._controlled - self._asked - self._answers.keys())
+            failures += [f"{name} has a controller, and no plant of it answers" for name in without_plant]
+        failures += _unanswered(self._here, but=("controller", "recorder", "router"), why=find_reasons)
+        if not self._answers and not failures:
+            subject = "no plant" if self._vehicle == "*" else f"no plant of {self._vehicle}"
+            failures.append(_nobody(self._network, subject))
+        return failures
 
 
 def _user(certificate: Certificate | None) -> str:

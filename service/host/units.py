@@ -14,10 +14,12 @@ from typing import Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.runtime.realtime import PRIORITY
+from aeroloop.protocol.transport.network_settings import Endpoint, NetworkSettings
 from aeroloop.service.config import Settings
 
 CONFIG: Final = Path("/etc/aeroloop/aeroloop.toml")
 SYSTEM_FOLDER: Final = Path("/etc/systemd/system")
+FIREWALL: Final = "aeroloop.nft"
 UNITS: Final = {
     "router": "the router that all others connect to",
     "recorder": "the recorder of everything on the network",
@@ -58,6 +60,27 @@ SystemCallArchitectures=native
 [Install]
 WantedBy=multi-user.target
 """
+
+
+NEW_PER_S: Final = 2
+NEW_BURST: Final = 10
+_FIREWALL: Final = """\
+# Limits new connections by address and port, for `nft -f`: at most {per_s} a second after a burst of {burst}.
+table inet aeroloop
+delete table inet aeroloop
+table inet aeroloop {{
+  set newcomers {{ type ipv4_addr . inet_proto . inet_service; flags dynamic; timeout 1m; size 65535; }}
+  set newcomers6 {{ type ipv6_addr . inet_proto . inet_service; flags dynamic; timeout 1m; size 65535; }}
+  chain input {{
+    type filter hook input priority filter; policy accept;
+    meta l4proto {{ tcp, udp }} th dport {{ {ports} }} ct state new update @newcomers \\
+      {{ ip saddr . meta l4proto . th dport limit rate over {per_s}/second burst {burst} packets }} drop
+    meta l4proto {{ tcp, udp }} th dport {{ {ports} }} ct state new update @newcomers6 \\
+      {{ ip6 saddr . meta l4proto . th dport limit rate over {per_s}/second burst {burst} packets }} drop
+  }}
+}}
+"""
+"""A failed handshake keeps Zenoh's listener from accepting for 0.1 s: two a second leave it most of its time."""
 
 
 class UnitError(AeroloopError):
@@ -110,14 +133,39 @@ def unit(name: str, source: Source) -> str:
 
 
 def install(folder: Path, source: Source) -> list[Path]:
-    """Write every unit into a folder, over an older one, and return their paths. Raises UnitError if it cannot."""
-    paths = {name: folder / f"aeroloop-{name}.service" for name in units_of(source.settings)}
+    """Write every unit into a folder, over an older one, and the firewall's rules if any; return their paths.
+
+    Raises UnitError if it cannot.
+    """
+    texts = {folder / f"aeroloop-{name}.service": unit(name, source) for name in units_of(source.settings)}
+    rules = firewall(source.settings.network)
+    if rules:
+        texts[folder / FIREWALL] = rules
     try:
-        for name, path in paths.items():
-            path.write_text(unit(name, source))
+        for path, text in texts.items():
+            path.write_text(text)
     except OSError as error:
         raise UnitError(f"cannot write into {folder}: {error.strerror}") from None
-    return list(paths.values())
+    return list(texts)
+
+
+def firewall(network: NetworkSettings) -> str:
+    """Rules of nftables that limit new connections to each port, for every host; empty where none goes beyond loopback.
+
+    By address and port: an operator's commands try several ports at once, and each has its own limit.
+    """
+    endpoints = [Endpoint.parse(text) for text in (*network.rendezvous_endpoints, *network.listen)]
+    ports = sorted({place.port for place in endpoints if place.leaves_host and place.port})
+    if not ports:
+        return ""
+    ranges: list[list[int]] = []  # first and last of consecutive ports
+    for port in ports:
+        if ranges and ranges[-1][1] == port - 1:
+            ranges[-1][1] = port
+        else:
+            ranges.append([port, port])
+    listed = ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in ranges)
+    return _FIREWALL.format(ports=listed, per_s=NEW_PER_S, burst=NEW_BURST)
 
 
 def next_steps(folder: Path | None, source: Source) -> list[str]:
@@ -134,6 +182,9 @@ def next_steps(folder: Path | None, source: Source) -> list[str]:
         steps.append(f"sudo {shlex.join(command)}")
     elif folder.absolute() != SYSTEM_FOLDER:
         steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
+    if firewall(source.settings.network):
+        rules = shlex.quote(str((folder or SYSTEM_FOLDER).absolute() / FIREWALL))
+        steps.append(f"sudo nft -f {rules}  # against floods of connections; to last, include it in /etc/nftables.conf")
     names = " ".join(f"aeroloop-{name}" for name in units_of(source.settings))
     return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
 

@@ -19,8 +19,10 @@ from aeroloop.service.testing.hil import Hil
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.certified_link import open_session
-from tests.support.processes import PATIENT
 from tests.support.zenoh_network import eventually
+
+PATIENT: Final = {"plant.watchdog_s": 10, "controller.stale_s": 10, "wire.counter_bits": 14}
+"""The watchdog is not the matter here, and must not end a session on a machine that stalls for seconds."""
 
 
 @pytest.mark.smoke
@@ -46,7 +48,7 @@ def test_a_secured_loop_runs_and_is_operated_with_certificates_only(hil: Hil, tm
     for security in (network.security.model_copy(update={"directory": str(foreign.folder)}), SecuritySettings()):
         met = network.rendezvous if security.folder else [network.rendezvous[0].replace("tls", "tcp")]
         stranger = network.model_copy(update={"security": security, "rendezvous": met})
-        assert stop(stranger).answers == []
+        assert stop(stranger, patience_s=1.0).answers == []
         with pytest.raises(OperatorError, match="issuer certificate" if security.folder else "no role answers"):
             gather(stranger)
     assert not hil.happened("tripped")
@@ -63,6 +65,10 @@ STRANGERS: Final = {
     ("controller", "bero"): frozenset(topics.TOPICS),
     ("operator", "bero"): frozenset(topics.TOPICS),
 }  # certificates, and topics that are not theirs
+
+
+CAUSED: Final = ("armed", "changed", "claimed", "released", "tripped", "marked", "stopped")
+"""Events of what a stranger asks for, if it is done. A busy machine has others, of lost or late frames."""
 
 
 def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:
@@ -109,7 +115,7 @@ def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: 
         for who, names in STRANGERS.items():
             harass(joined[who], names, running, tokens)
         hil.run(1.0)
-        assert [event.text for event in hil.events[before:] if event.kind != "refused"] == []
+        assert [event.text for event in hil.events[before:] if event.kind in CAUSED] == []
         assert (hil.state("plant"), hil.state("controller")) == ("driven", "running")
         assert hil.status("controller").session == hil.status("plant").session == running
         harass(joined["operator", "aero"], frozenset({"stop"}), running, tokens)  # as a proof that it would have

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -314,21 +315,58 @@ def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
 
 
 @pytest.mark.parametrize(
-    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "x.y=1"]
+    ("variable", "file", "about"),
+    [
+        ("AEROLOOP_DEBUG", "", "AEROLOOP_DEBUG in the environment is no setting: unset it"),
+        ("AEROLOOP_X__Y", "", "AEROLOOP_X__Y in the environment is no setting: unset it"),
+        ("AEROLOOP_LOOP_RATE_HZ", "", "AEROLOOP_LOOP_RATE_HZ in the environment is no setting"),
+        ("", "[x]\ny = 1\n", "x in the configuration is no setting"),
+    ],
+)
+def test_what_is_unknown_is_a_warning_to_an_operator_s_verb_and_an_error_to_a_daemon(
+    variable: str, file: str, about: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(file)
+    if variable:
+        monkeypatch.setenv(variable, "1")
+    warnings: list[str] = []
+    assert load_target(path, (), warnings.append) == Target()
+    (warning,) = warnings
+    assert warning.startswith(about)
+    with pytest.raises(ConfigError):
+        load(path)
+
+
+@pytest.mark.parametrize("variable", ["NETWRK__MODE", "NETWORK_MODE", "VEHICEL", "MODE", "RENDEZVOUS", "NETWORK__MOD"])
+def test_a_variable_that_may_be_meant_as_vehicle_or_network_is_refused(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ENV_PREFIX + variable, "client")
+    with pytest.raises(ConfigError, match=variable):
+        load_target()
+
+
+@pytest.mark.parametrize(
+    "given", ["netwrok.mode=peer", "network.mod=peer", "vehicle=a/b", "network.mode=mesh", "rendezvous=tcp/h:1"]
 )
 def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
     with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):
         load_target(None, [given])
 
 
-def test_every_plant_is_stopped_unless_a_vehicle_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_plant_is_stopped_unless_a_vehicle_is_configured(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     stopped: list[str | None] = []
 
-    def stop(_: object, vehicle: str | None) -> operator.Stopped:
+    def stop(_: object, vehicle: str | None, on_answer: Callable[[str], object]) -> operator.Stopped:
         stopped.append(vehicle)
+        on_answer("at 0 V")
         return operator.Stopped(["at 0 V"], [])
 
     monkeypatch.setattr(operator, "stop", stop)
     for words in ((), ("--set", "vehicle=aero"), ("--set", "vehicle=aero", "--all")):
         assert execute(["op", "stop", *words]) == 0
+        assert capfd.readouterr().out == "at 0 V\n"  # once
     assert stopped == [None, "aero", None]

@@ -21,7 +21,7 @@ from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil_log import HilLog
 from tests.support.certificates import Authority
 from tests.support.namespaces import RECOVERY_S, STOP_WAIT_S, Hosts, Ways
-from tests.support.zenoh_network import eventually
+from tests.support.zenoh_network import PATIENCE_S, eventually
 
 Kind = Literal["peers", "router"]
 HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")  # in the order of their addresses
@@ -44,10 +44,13 @@ class Outcome(NamedTuple):
 
 
 class Deployment(Hosts):
-    """Hosts of an example configuration with a certificate each; `daemons` by host, once started."""
+    """Hosts of an example configuration with a certificate each; `daemons` by host, once started.
 
-    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
-        super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")
+    `strangers` are further hosts, without a certificate.
+    """
+
+    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = (), strangers: Sequence[str] = ()) -> None:
+        super().__init__((*HOSTS, *strangers), folder, EXAMPLES / f"hosts-{kind}.toml")
         self.kind = kind
         self.daemons: dict[str, Popen[bytes]] = {}
         self.log_file = folder / "log.mcap"
@@ -127,10 +130,12 @@ class Deployment(Hosts):
         self.daemons[host].wait(STOP_WAIT_S)
 
     def await_driven(self, since: float) -> None:
-        """Wait for a status of a driven plant that arrives after a time [s since 1970]."""
-        eventually(
-            "driving", lambda: any(line.get("state") == "driven" and line["at"] > since for line in self._seen())
-        )
+        """Wait for a status of a driven plant that arrives after a time [s since 1970]; processes may start first."""
+
+        def is_driven() -> bool:
+            return any(line.get("state") == "driven" and line["at"] > since for line in self._seen())
+
+        eventually("driving", is_driven, 4 * PATIENCE_S)
 
     def finish(self) -> list[Outcome]:
         """End the daemons, the recorder after the ends, and read what each trouble cost from the log.

@@ -96,6 +96,10 @@ class Hosts:
         sets = [word for override in [*network, *overrides] for word in ("--set", override)]
         return [*(["--config", str(self._config)] if self._config else []), *sets]
 
+    def command(self, host: str, *words: str) -> list[str]:
+        """The words that run Python on a host."""
+        return ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
+
     def python(
         self,
         host: str,
@@ -104,7 +108,7 @@ class Hosts:
         stdout: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> subprocess.Popen[bytes]:
-        command = ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
+        command = self.command(host, *words)
         with self.log(host).open("ab") as errors, (stdout or Path(os.devnull)).open("ab") as output:
             inherited = {**os.environ, "STATE_DIRECTORY": str(self._folder / "state")}
             process = subprocess.Popen(
@@ -157,6 +161,10 @@ class Hosts:
                 drop = f"numgen random mod 1000 < {round(10 * percent)} drop;"
                 table += f"table netdev {device} {{ chain lossy {{ {hook} {drop} }}; }}"
             _run("ip", "netns", "exec", where, "nft", "-f", "-", given=table)
+
+    def filter_packets(self, host: str, ruleset: str) -> None:
+        """Give a host rules of nftables."""
+        _run("ip", "netns", "exec", self._prefix + host, "nft", "-f", "-", given=ruleset)
 
     def crossed(self, host: str) -> tuple[int, int]:
         """Bytes that a host has sent and received so far, with all headers."""

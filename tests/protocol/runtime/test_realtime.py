@@ -148,6 +148,14 @@ def test_deadlines_are_absolute_never_burst_and_every_tick_is_taken_or_counted(
         last = k
 
 
+def test_a_tick_that_is_a_whole_period_late_is_skipped_and_the_next_one_is_due_now() -> None:
+    clock = FakeClock()
+    grid = TickGrid(PERIOD, clock=clock)
+    grid.wait()
+    clock.now_ns += 2 * PERIOD  # tick 1 was due a period ago, and tick 2 is due now
+    assert (grid.wait(), grid.skipped, clock.slept) == (2, 1, [])
+
+
 def test_the_first_of_a_kind_passes_and_what_follows_is_held_back_and_counted() -> None:
     clock = FakeClock(0)  # a machine that has just started
     throttle = Throttle(10.0, clock)

@@ -129,7 +129,7 @@ def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
     open_sessions.enter_context(closing(route(settings, ROUTER)))
     member = open_sessions.enter_context(closing(join(settings, SPEAKER)))
     token = member.liveliness().declare_token(ALIVE)
-    assert stop(settings).failures == ["aero has a controller, and no plant of it answers"]
+    assert stop(settings, patience_s=0).failures == ["aero has a controller, and no plant of it answers"]
     token.undeclare()
 
 

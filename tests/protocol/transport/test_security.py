@@ -272,6 +272,10 @@ BROKEN: dict[str, tuple[Callable[[Authority], object], tuple[str, ...]]] = {
         lambda ca: ca.issue("controller", "aero", file="plant.aero"),
         ("certificate of controller/aero, not of plant/aero",),
     ),
+    "another vehicle's": (
+        lambda ca: ca.issue("plant", "bero", file="plant.aero"),
+        ("certificate of plant/bero, not of plant/aero",),
+    ),
     "no role": (lambda ca: ca.issue("plant", "aero", cn="plant.aero"), ("common name is 'plant.aero'",)),
     "garbage": (lambda ca: (ca.folder / "plant.aero.pem").write_text("-----"), ("is no certificate in PEM",)),
 }

@@ -52,9 +52,10 @@ def test_keys_are_the_owners_alone_and_nothing_is_overwritten(folder: Path) -> N
         with pytest.raises(CertificateError, match="is not overwritten"):
             again(folder)
     assert files(folder) == before
-    (folder / "open").mkdir(mode=0o755)
-    with pytest.raises(CertificateError, match="chmod 700"):
-        keys.init(folder / "open")
+    for mode in (0o750, 0o705, 0o710):  # to a group, to others, to enter only
+        (folder / f"{mode:o}").mkdir(mode=mode)
+        with pytest.raises(CertificateError, match="chmod 700"):
+            keys.init(folder / f"{mode:o}")
 
 
 def test_no_certificate_outlives_its_authority(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,6 +101,25 @@ def test_units_are_written_over_older_ones_with_the_steps_that_start_them(
     assert run([*words, "--install", str(tmp_path / "nowhere")]) == 1
 
 
+def test_the_firewall_limits_new_connections_to_the_ports_beyond_this_host(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """That the rules do what they are for: tests/hil/test_floods.py."""
+    hosts = 'network.rendezvous=["tcp/10.0.0.1:7447","tls/[fd00::2]:7000"]'
+    rules = units.firewall(load(overrides=[hosts, 'network.listen=["tcp/10.0.0.1:7456", "tcp/127.0.0.1:9"]']).network)
+    assert rules.count("th dport { 7000-7007, 7447-7454, 7456 }") == 2  # of IPv4 and of IPv6
+    router = load(overrides=["network.mode=client", "network.rendezvous=tcp/10.0.0.1:7447"])
+    assert units.firewall(router.network).count("th dport { 7447 }") == 2
+    assert units.firewall(load().network) == ""  # on loopback
+    words = ["host", "units", "--set", hosts]
+    assert run(words) == 0
+    assert "aeroloop.nft\n# Limits" in capfd.readouterr().out
+    assert run([*words, "--install", str(tmp_path)]) == 0
+    out = capfd.readouterr().out
+    assert f"sudo nft -f {tmp_path}/aeroloop.nft" in out
+    assert "inet_service" in (tmp_path / "aeroloop.nft").read_text()
+
+
 @pytest.mark.parametrize("via", VIAS)
 def test_systemd_finds_nothing_wrong_with_any_unit(via: str, tmp_path: Path) -> None:
     systemd = shutil.which("systemd-analyze")
