@@ -1,16 +1,22 @@
 """Plug-ins: classes that the configuration names, ours by a short name, a user's as `package.module:Class`.
 
 A module is looked for where Python looks, and in the current folder. Importing it runs its code, so a class is only
-looked up by a process that uses it.
+looked up by a process that uses it, and only if its module is trusted: ours, imported already, installed beside
+aeroloop, or named by the user (`vouch_for`) in the configuration, by `--set` or by `--law`. What only a log names, or a
+description from the network, is imported within `trusting` alone: `--trust-law`.
 """
 
 from __future__ import annotations
 
+import site
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
 from inspect import getsourcefile, getsourcelines
 from pathlib import Path
 from sysconfig import get_path
@@ -29,16 +35,78 @@ class PluginError(ConfigError):
     """A class that is not there, is of another kind, or failed; one line with its name."""
 
 
+class UntrustedError(PluginError):
+    """A class whose module is not trusted, and so not imported."""
+
+
+_named: set[str] = set()
+_trusts_all: ContextVar[bool] = ContextVar("trusts_all", default=False)
+
+
+def vouch_for(*words: str) -> None:
+    """The user has named these classes, or files of code: this process may run them."""
+    _named.update(words)
+
+
+def vouched_for() -> frozenset[str]:
+    """All that the user has named in this process."""
+    return frozenset(_named)
+
+
+@contextmanager
+def trusting(everything: bool = True) -> Iterator[None]:
+    """Import whatever a log names while this lasts, if `everything`: `--trust-law`."""
+    token = _trusts_all.set(everything or _trusts_all.get())
+    try:
+        yield
+    finally:
+        _trusts_all.reset(token)
+
+
+def check_named(key: str, what: str) -> None:
+    """Raise UntrustedError unless the user has named this, such as the file of an FMU, whose binary code would run."""
+    if not (_trusts_all.get() or what in _named):
+        raise UntrustedError(f"{key} = {what!r} is not run, as only a log names it: give --trust-law, which does")
+
+
+def is_trusted(kind: str) -> bool:
+    """Whether `module:Class` may be imported. This imports nothing."""
+    module = kind.partition(":")[0]
+    return _trusts_all.get() or kind in _named or module in sys.modules or _is_installed(module.partition(".")[0])
+
+
+def _is_installed(package: str) -> bool:
+    """Whether a top-level package is ours, or in a folder into which packages are installed."""
+    if package == __name__.partition(".")[0]:
+        return True
+    try:
+        spec = find_spec(package)
+    except (ImportError, ValueError):
+        return False
+    if spec is None:
+        return False
+    places = [Path(place).parent for place in spec.submodule_search_locations or ()]
+    if not places and spec.origin is not None:
+        places = [Path(spec.origin).parent]
+    folders = {Path(folder) for folder in (get_path("purelib"), get_path("platlib"), *site.getsitepackages())}
+    if site.ENABLE_USER_SITE:
+        folders.add(Path(site.getusersitepackages()))
+    return bool(places) and all(place in folders for place in places)
+
+
 def find(key: str, kind: str, built_in: Mapping[str, str], base: type[T]) -> type[T]:
     """The class, derived from `base`, that `kind` names: one of ours, or `module:Class`.
 
-    `key` is the configuration's key that holds it, such as `law.kind`, for messages. Raises PluginError if there is no
-    such class, its module fails, or it does not derive from `base`.
+    `key` is the configuration's key that holds it, such as `law.kind`, for messages. Raises UntrustedError if its
+    module is not trusted, PluginError if there is no such class, its module fails, or it does not derive from `base`.
     """
     given = f"{key} = {kind!r}"
     module_name, _, name = built_in.get(kind, kind).partition(":")
     if not (module_name and name):
         raise PluginError(f"{given} is not known: it is one of {', '.join(sorted(built_in))}, or package.module:Class")
+    if kind not in built_in and not is_trusted(kind):
+        remedy = f"give --trust-law, which runs its code (in Python, import {module_name} first)"
+        raise UntrustedError(f"{given} is not imported, as only a log names it: {remedy}")
     if str(Path.cwd()) not in sys.path and "" not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:

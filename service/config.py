@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol import plugins
 from aeroloop.protocol.messages.operator import AS_PUBLISHED, Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings, counter_fills_frame
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
@@ -128,8 +129,14 @@ def load(file: Path | None = None, overrides: Sequence[str] = (), *, runs_law: b
         ConfigError: The configuration is wrong.
     """
     defaults = Settings().model_dump(exclude={"law"})  # a section may set one key of a signal, and leave the others
-    settings = valid(Settings, merged(defaults, read_sources(file, overrides, keys(Settings))))
+    settings = vouched(valid(Settings, merged(defaults, read_sources(file, overrides, keys(Settings)))))
     return with_law_settings(settings) if runs_law else settings
+
+
+def vouched(settings: Settings) -> Settings:
+    """A configuration whose classes, and whose FMU, the user has named: their code may run in this process."""
+    plugins.vouch_for(settings.law.kind, settings.plant.kind, str(settings.plant.own.get("file")))
+    return settings
 
 
 def with_law_settings(settings: Settings) -> Settings:
@@ -172,8 +179,18 @@ def from_description(config: dict[str, Any]) -> Settings:
 
 
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
-    """A configuration with some values replaced. Raises ConfigError as `load` does."""
-    return valid(Settings, merged(settings.description(), tree_of(overrides)))
+    """A configuration with some values replaced. Classes that the overrides name, the user has named.
+
+    Raises:
+        ConfigError: An override is wrong.
+    """
+    tree = tree_of(overrides)
+    replaced = valid(Settings, merged(settings.description(), tree))
+    for section in ("law", "plant"):
+        given = tree.get(section)
+        if isinstance(given, dict) and "kind" in given:
+            plugins.vouch_for(getattr(replaced, section).kind)
+    return replaced
 
 
 def bits_overrides(text: str | None) -> list[str]:

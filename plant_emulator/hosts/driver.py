@@ -13,6 +13,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.timing import Clock, LoopTiming, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.protocol.wire.transmit import UNCHANGED
 
@@ -80,7 +81,12 @@ class Driver:
         self, endpoint: Endpoint, network: PlantNetwork, loop: LoopSettings, stop: threading.Event, clock: Clock = time
     ) -> None:
         self._endpoint, self._network, self._loop, self._stop, self._clock = endpoint, network, loop, stop, clock
-        self._counter = 0  # of the measurement sent last
+        self._sent = self._ticks_of_session()
+
+    def _ticks_of_session(self) -> TickCounter:
+        """What the controller counts in lockstep, from a session's start on."""
+        counters = self._endpoint.wire.measurement.counters
+        return TickCounter(self._loop.period_ns, counters, lockstep=True)
 
     def run(self) -> None:
         """Run, then close the plant at 0 V and leave the network. Raises PlantError if the plant failed; it tripped."""
@@ -159,15 +165,17 @@ class Driver:
         measurement = endpoint.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = self._clock.monotonic_ns()
         echo, layout = None, endpoint.wire.measurement
+        if endpoint.session_tick == 0:
+            self._sent = self._ticks_of_session()
         for sent in endpoint.outgoing:
             if (sent or lockstep) and network.link is not None:
                 network.link.send(sent)
                 network.sent += sent != UNCHANGED
             if lockstep:
-                # The controller takes a frame without a counter for the tick after its last.
-                echo = layout.counter(sent)
-                self._counter = (self._counter + 1) % layout.counters if echo is None else echo
-                if sent == UNCHANGED:
-                    echo = self._counter
+                counter = layout.counter(sent)
+                tick = self._sent.advance_one() if counter is None else self._sent.advance(counter, 0)
+                # The controller answers no repeated, older or malformed frame.
+                if tick is not None and (counter is not None or sent == UNCHANGED):
+                    echo = tick % layout.counters
         network.after_tick(measurement, arrival, sent_ns)
         return echo

@@ -16,15 +16,15 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.endpoint.endpoint import VehicleClaim
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, VehicleClaim
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.plant import class_of
 from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol import plugins
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, Tail, TraceWriter
-from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.runtime.timing import Clock
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -134,30 +134,39 @@ def cut(batch: Batch, rows: int) -> Batch:
 
 
 def why_not(plant: PlantSettings) -> str | None:
-    """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class."""
+    """Why no log of a plant can be replayed; None if it can. Of a plant that is no body of ours this imports the class.
+
+    Raises PluginError if there is no such class here, or its code is not trusted.
+    """
     if plant.via != "emulator":
         return f"plant.via is {plant.via!r}: only an emulated plant is computed again"
     if plant.emulated:
         return None
-    try:
-        found = class_of(plant.kind)
-    except PluginError as error:
-        return str(error)
+    if plant.kind == "fmu":
+        plugins.check_named("plant.own.file", str(plant.own.get("file")))
+    found = class_of(plant.kind)
     return None if found.repeatable else f"{found.__name__} (plant.kind) does not state that it is `repeatable`"
 
 
 class PlantReplay:
     """Replays one process of an emulated plant: `endpoint` is as it was after the last row, `last` that row computed.
 
-    Raises ValueError with the reason of `why_not`, or PlantError.
+    `on_tick` is called after each tick, before its row is compared. Raises ValueError with the reason of `why_not`,
+    PluginError, or PlantError.
     """
 
-    def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
+    def __init__(
+        self,
+        loop: LoopSettings,
+        wire: WireSpec,
+        plant: PlantSettings,
+        on_tick: Callable[[Endpoint], None] = lambda _: None,
+    ) -> None:
         if reason := why_not(plant):
             raise ValueError(reason)
         self.endpoint = plant.endpoint(plant.make(loop.period), loop, wire)
         self.last: PlantRow | None = None
-        self._wire = wire
+        self._wire, self._on_tick = wire, on_tick
         self._run: int | None = None
         self._rows = self._ticks = self._differ = 0
         self._empty: set[Header] = set()  # of batches without rows
@@ -220,6 +229,7 @@ class PlantReplay:
         frames = {Sent.FRAME: logged["command"].tobytes(), Sent.SILENT: UNCHANGED, Sent.NONE: None}
         frame = frames.get(logged["received_as"], bytes(self._wire.command.size + 1))
         measurement = self.endpoint.tick(frame, int(logged["tick"]))
+        self._on_tick(self.endpoint)
         arrival = None if frame is None else Arrival(frame, 0)
         self.last = row = plant_row(self.endpoint, measurement, arrival, 0)
         computed = np.array([row._replace(answered=row.answered & NEVER)], logged.dtype)[0]

@@ -88,11 +88,13 @@ class TickCounter:
     next. As the two clocks drift apart, the mark may move later by 2 % of the elapsed periods: twice the error of a
     clock that runs 1 % fast, so that it follows either clock and still recovers from a mark that is too early.
 
-    In lockstep the counter alone gives the tick, and the last one's again is a repetition. `tick` is that of the last
-    measurement that was newer than all before it; −1 at a session's start.
+    In lockstep the counter alone gives the tick: the next one that has it, unless that is more than 3/4 of the
+    counter's range ahead; then the frame repeats the last one, or is older. `tick` is that of the last measurement that
+    was newer than all before it; −1 at a session's start.
     """
 
     DRIFT: Final = 50  # the mark may move later by one period in this many
+    OLD: Final = 0.75  # share of the counter's range: in lockstep a frame that seems further ahead is an older one
 
     def __init__(self, period_ns: int, counters: int, *, lockstep: bool, tick: int = -1) -> None:
         self._period_ns = period_ns
@@ -107,8 +109,10 @@ class TickCounter:
 
         None if it is not newer than the last one.
         """
-        if self._lockstep and self.tick >= 0 and counter == self.tick % self._counters:
-            return None
+        if self._lockstep and self.tick >= 0:
+            ahead = (counter - self.tick) % self._counters
+            if ahead == 0 or ahead > self.OLD * self._counters:
+                return None
         if self._origin_ns is None:
             tick = self.tick + 1 + (counter - self.tick - 1) % self._counters
             if not self._lockstep:
@@ -122,6 +126,11 @@ class TickCounter:
             self._origin_ns = min(self._origin_ns + drift_ns, at_ns - tick * self._period_ns)
         self.tick = tick
         return tick
+
+    def advance_one(self) -> int:
+        """The tick of a measurement without a counter in lockstep, such as an empty frame: the one that is due."""
+        self.tick += 1
+        return self.tick
 
     @property
     def known(self) -> bool:

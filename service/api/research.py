@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.plugins import trusting
 from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, as_overrides, load
@@ -70,6 +71,7 @@ class RecordedRun:
         ticks: One row a tick in each column; see `Ticks` for names, shapes and units.
         paths: The log's files.
         vehicle, session: Which session of them it is.
+        trust_law: Whether a law that only the log names may be imported, as of `read_run`.
     """
 
     settings: Settings
@@ -78,6 +80,7 @@ class RecordedRun:
     paths: tuple[Path, ...]
     vehicle: str
     session: str
+    trust_law: bool = False
 
     @property
     def time(self) -> npt.NDArray[np.floating]:
@@ -110,28 +113,36 @@ class RecordedRun:
         Raises:
             AeroloopError: It cannot be forked so.
         """
-        return fork(
-            self.paths, at, session=self.session, vehicle=self.vehicle, overrides=as_overrides(overrides or {}),
-            faults=faults, duration_s=duration_s, log=None if log is None else Path(log),
-        )  # fmt: skip
+        with trusting(self.trust_law):
+            return fork(
+                self.paths, at, session=self.session, vehicle=self.vehicle, overrides=as_overrides(overrides or {}),
+                faults=faults, duration_s=duration_s, log=None if log is None else Path(log),
+            )  # fmt: skip
 
     @cached_property
     def _instants(self) -> Instants:
-        return Instants(self.paths, self.session, self.vehicle)
+        with trusting(self.trust_law):
+            return Instants(self.paths, self.session, self.vehicle)
 
 
-def read_run(*paths: Path | str, session: str | None = None, vehicle: str | None = None) -> RecordedRun:
+def read_run(
+    *paths: Path | str, session: str | None = None, vehicle: str | None = None, trust_law: bool = False
+) -> RecordedRun:
     """Read a session of a log as arrays.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         session: Its name, or its number from 1 in the order of recording; the longest if None.
         vehicle: Its vehicle; that of the longest session if None.
+        trust_law: Whether to import a law, or a plant, that only the log names, which runs its code. Ours, installed
+            and already imported ones always are. Without its law, a run's gains and state are empty, and its voltages
+            before quantization NaN.
 
     Raises:
         AeroloopError: Not a log, several unrelated runs, or no such session.
     """
     files = tuple(map(Path, paths))
-    read = review.read(*files, session=session, vehicle=vehicle)
+    with trusting(trust_law):
+        read = review.read(*files, session=session, vehicle=vehicle)
     found = read.findings
-    return RecordedRun(read.settings, read.figures, read.ticks, files, found.vehicle, found.session)
+    return RecordedRun(read.settings, read.figures, read.ticks, files, found.vehicle, found.session, trust_law)

@@ -145,14 +145,25 @@ def laws(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Compare control laws, tuned alike. Proven bound, error, effort, chatter, bits, delay and loss survived."""
+    """Compare control laws, tuned alike. Proven bound, error, effort, chatter, bits, delay and loss survived.
+
+    Exits with 1 if a run has no figures, such as one that tripped.
+    """
     settings = load_for_loop(config, overrides, bits=bits)
-    from aeroloop.service.lab.laws import compare, compared_laws, sheets
+    from aeroloop.service.lab.laws import compare, compared_laws, laws_in_python, sheets
 
     compared = compared_laws(settings, law or ())
+    in_python = laws_in_python(settings, compared)
+    if in_python:
+        report(
+            f"plain Python: {', '.join(in_python)}; its runs and searches go tick by tick, a hundred times slower than "
+            "those of expressions; --duration 5 --seeds 1 is a first look"
+        )
     with working("experiments and searches", json) as update:
         result = compare(settings, compared, seeds=seeds, duration_s=duration, engine=engine, progress=update)
     show(result, json, sheets, markdown)
+    if any(row["reason"] is not None for row in result.rows):
+        raise typer.Exit(1)
 
 
 def sweep(
@@ -174,7 +185,10 @@ def sweep(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run an experiment for every combination of values and seeds. Writes a table of their figures."""
+    """Run an experiment for every combination of values and seeds. Writes a table of their figures.
+
+    Exits with 1 if a row has a reason instead of figures, such as a trip.
+    """
     settings = load_for_loop(config, overrides, bits=bits)
     from aeroloop.service.lab.axes import configurations, parse_axes
     from aeroloop.service.lab.sweep import SweepPlan, check_table, rows_file, run_sweep, sheets
@@ -190,6 +204,8 @@ def sweep(
             report(f"interrupted; what has run is in {rows_file(out)}, and the same command goes on from there")
             raise
     show(result, json, sheets)
+    if result.failed:
+        raise typer.Exit(1)
 
 
 def tune(

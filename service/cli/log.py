@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
+from aeroloop.protocol.plugins import trusting
 from aeroloop.service.cli.common import (
     Address,
     Config,
@@ -38,6 +39,15 @@ Vehicle = Annotated[
 ]
 Since = Annotated[float, typer.Option("--from", metavar="S", help="From this time on only.", show_default=False)]
 Until = Annotated[float, typer.Option("--to", metavar="S", help="To this time only.", show_default=False)]
+
+TrustLaw = Annotated[
+    bool,
+    typer.Option(
+        "--trust-law",
+        help="Import the law, and the plant, that the log names, which runs their code. Without it only ours, those "
+        "installed beside aeroloop, and what this command names are imported.",
+    ),
+]
 
 Session = Annotated[str | None, typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.")]
 
@@ -69,6 +79,7 @@ def review(
     session: Session = None,
     vehicle: Vehicle = None,
     html: Html = None,
+    trust_law: TrustLaw = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -81,7 +92,7 @@ def review(
     limits = [Limit.parse(text) for text in require or []]
     check_output(html, logs, force=force)
     _check_part(since_s, until_s)
-    with working("reading", json, 1) as update:
+    with working("reading", json, 1) as update, trusting(trust_law):
         judged = read(*logs, session=session, vehicle=vehicle, progress=update, since_s=since_s, until_s=until_s)
     if figures is not None:
         from aeroloop.service.report.plots import draw_figures
@@ -103,6 +114,7 @@ def compare(
     logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.")],
     html: Html = None,
     require: Require = None,
+    trust_law: TrustLaw = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -116,7 +128,7 @@ def compare(
 
     limits = [Limit.parse(text) for text in require or []]
     check_output(html, logs, force=force)
-    with working("reading", json, 1) as update:
+    with working("reading", json, 1) as update, trusting(trust_law):
         reports = read_runs(logs, limits, update)
     if html is not None:
         _write_page(reports, html, logs, force)
@@ -149,6 +161,7 @@ def replay(
     machine: Annotated[
         Literal["host", "aarch64", "cortex-m4"], typer.Option("--machine", help="With --end c: where it runs.")
     ] = "host",
+    trust_law: TrustLaw = False,
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
@@ -163,7 +176,7 @@ def replay(
         end, answering = "controller", InC(machine)
     elif machine != "host":
         fail("--machine is for --end c", 2)
-    with working("replaying", json, 1) as update:
+    with working("replaying", json, 1) as update, trusting(trust_law):
         replayed = replay(logs, progress=update, ends=[end] if end else ENDS, answering=answering)
     show(replayed, json, replay_sheets)
     if replayed.differs or not replayed.complete:
@@ -181,6 +194,7 @@ def check(
     markdown: Annotated[
         Path | None, typer.Option("--markdown", metavar="FILE", help="Write the table for a pull request.")
     ] = None,
+    trust_law: TrustLaw = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -193,7 +207,7 @@ def check(
     words = [*(overrides or ()), *([f"law.kind={law}"] if law else [])]
     check_output(markdown, logs, force=force)
     with working("checking", json, 1) as update:
-        results = check_logs(logs, words, accept=accept, progress=update)
+        results = check_logs(logs, words, accept=accept, trust_law=trust_law, progress=update)
     same = all(one.same for one in results)
     show({"same": same, "logs": results}, json, lambda _: check_sheets(results), keys=2)
     if markdown is not None:
@@ -235,6 +249,7 @@ def step(
     ] = None,
     session: Session = None,
     vehicle: Vehicle = None,
+    trust_law: TrustLaw = False,
     json: Json = False,
 ) -> None:
     """Show all that is known of one tick. In a terminal, keys go on: n, p, u (until), q."""
@@ -242,7 +257,7 @@ def step(
     from aeroloop.service.terminal.log_sheets import instant_sheets
 
     instant = _instant(at)
-    with working("reading", json, 1) as update:
+    with working("reading", json, 1) as update, trusting(trust_law):
         run = Instants(logs, session, vehicle, update)
     tick = run.tick_at(instant)
 
@@ -286,6 +301,7 @@ def fork(
     html: Html = None,
     session: Session = None,
     vehicle: Vehicle = None,
+    trust_law: TrustLaw = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -300,7 +316,7 @@ def fork(
         *(f"law.{name}=[{values}]" for name, _, values in (g.partition("=") for g in gains or ())),
     ]
     check_output(html, logs, force=force)
-    with working("forking", json, 1) as update:
+    with working("forking", json, 1) as update, trusting(trust_law):
         forked = fork(
             logs, _instant(at), session=session, vehicle=vehicle, overrides=words, faults=inject or (),
             duration_s=duration, log=log, progress=update,
@@ -334,10 +350,24 @@ def live(
     run_alone(run)
 
 
+Format = Literal["parquet", "csv", "mcap"]
+
+
+def _format_of(out: Path | None) -> Format:
+    """The format that a new file's name ends in."""
+    formats: dict[str, Format] = {".parquet": "parquet", ".csv": "csv", ".mcap": "mcap"}
+    if out is None or out.suffix not in formats:
+        fail("name the new file's format: --format, or --out FILE.parquet, FILE.csv or FILE.mcap", 2)
+    return formats[out.suffix]
+
+
 @group.command()
 def export(
     logs: Logs,
-    form: Annotated[Literal["parquet", "csv", "mcap"], typer.Option("--format", help="Format of the new file.")],
+    form: Annotated[
+        Format | None,
+        typer.Option("--format", help="Format of the new file; what --out ends in if left out."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="The new file; the log's name with another suffix if left out.")
     ] = None,
@@ -353,6 +383,7 @@ def export(
             help="Only S seconds before and after a trip, fault or mark, or words of one.",
         ),
     ] = None,
+    trust_law: TrustLaw = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -360,9 +391,11 @@ def export(
     from aeroloop.service.terminal.log_sheets import export_sheets
 
     _check_part(since_s, until_s)
+    if form is None:
+        form = _format_of(out)
     if form == "mcap" and (session, vehicle, since_s, until_s) != (None, None, -inf, inf):
         fail("--session, --vehicle, --from and --to choose the rows of a table; --format mcap takes --around only", 2)
-    with working("exporting", json, 1) as update:
+    with working("exporting", json, 1) as update, trusting(trust_law):
         if form == "mcap":
             from aeroloop.service.logs.copies import copy
 

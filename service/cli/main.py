@@ -55,6 +55,12 @@ def execute(arguments: Sequence[str]) -> int:
         if message.startswith("Usage: "):  # help, where no verb was given
             typer.echo(message, err=True)
         else:
+            possibilities = getattr(error, "possibilities", None)
+            if possibilities:  # of an unknown option those that are only faintly like it, too
+                from aeroloop.protocol.wording import closest
+
+                near = closest(getattr(error, "option_name", ""), possibilities)
+                message = error.message + (f": did you mean {near}?" if near else "")
             hint = f" (see `{context.command_path} --help`)" if context else ""
             report(" ".join(message.split()).rstrip(".") + hint)
         return error.exit_code

@@ -7,7 +7,7 @@ vehicle on the network, and the others about the only one: where there are sever
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -26,6 +26,9 @@ Within = Annotated[
     float | None,
     typer.Option("--in", metavar="S", help="Time to get there, in s; the shortest within the limits if left out."),
 ]
+
+REFERENCES: Final = ("configured", "sinusoid", "hold", "stream")
+"""What `op track` takes beside a file."""
 
 group = typer.Typer()
 
@@ -243,6 +246,7 @@ def track(
 ) -> None:
     """Follow another reference: a sinusoid, a file, set-points. `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
+    from aeroloop.protocol.wording import closest
     from aeroloop.service.settings import read_points
 
     options = {name: each for name, each in (("amplitude", amplitude), ("frequency", frequency)) if each is not None}
@@ -260,6 +264,9 @@ def track(
             case "stream":
                 reference = Stream()
             case _:
+                near = closest(what, REFERENCES)
+                if near is not None and not Path(what).exists():
+                    fail(f"{what} is neither a reference nor a file: did you mean {near}?", 2)
                 reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
     _send(config, overrides, "track", message)

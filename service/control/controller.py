@@ -31,6 +31,7 @@ from aeroloop.service.control.laws.registry import (
     law_function,
     law_of,
     no_number,
+    no_such_gain,
     words_of,
 )
 from aeroloop.service.control.motion import Motion
@@ -268,7 +269,10 @@ class Controller:
     # ── gains, reference and state ──
 
     def set_gains(self, gains: Gains) -> None:
-        """Use other gains from the next tick on; None leaves a gain unchanged."""
+        """Use other gains from the next tick on; None leaves a gain unchanged. Raises LawError if the law has none."""
+        for name, gain in gains.named.items():
+            if len(self._gains.get(name, ())) != len(gain):
+                raise no_such_gain(self.law.settings.kind, name, len(gain))
         for name, gain in gains.named.items():
             _write_to(self._gains[name], gain)
 

@@ -16,7 +16,7 @@ from aeroloop.protocol.messages.operator import Answer, MessageError
 from aeroloop.protocol.runtime.node import EncodedOnce, Node, log_event
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
-from aeroloop.service.daemon.tick_source import MAILBOX
+from aeroloop.service.daemon.tick_source import LOCKSTEP_MAILBOX, MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0
 
@@ -48,14 +48,17 @@ class ClaimClient:
         if carrier is None:
             return None
         self.by_datagrams = carrier is not role.zenoh
-        sparse = self._wire.transmit.measurement == "on_change" and not self._loop.lockstep
+        if self._loop.lockstep:
+            depth = LOCKSTEP_MAILBOX
+        else:
+            depth = MAILBOX if self._wire.transmit.measurement == "on_change" else 1
         link = ZenohLink(
             carrier,
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lengths=self._wire.lengths("measurement", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
-            depth=MAILBOX if sparse else 1,
+            depth=depth,
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):

@@ -75,10 +75,11 @@ class Daemon:
                     self._session = None
                     session.end()
                 if not finished and own.duration_s and not role.stop.is_set():
-                    raise SessionLostError(
-                        f"{self._shared.cause} after {session.controller.tick_index + 1} ticks, so the run is over"
-                        + ("" if loop.lockstep else "; a machine too busy for real time can run it in lockstep")
-                    )
+                    ticks = session.controller.tick_index + 1
+                    text = f"{self._shared.cause} after {ticks} ticks, so the run is over"
+                    if machine.state is State.SEARCHING and not loop.lockstep:  # lost, not faulted, stopped or released
+                        text += "; a machine too busy for real time can run it in lockstep"
+                    raise SessionLostError(text)
         finally:
             machine.fire(Trigger.STAND_DOWN)
             role.event("stopped", f"{role.name} stopped commanding")

@@ -21,6 +21,9 @@ from aeroloop.protocol.wire.transmit import UNCHANGED
 MAILBOX: Final = 16
 """Frames that may wait where silence is allowed: a displaced frame could not be classified as late."""
 
+LOCKSTEP_MAILBOX: Final = 1 << 17
+"""Frames that may wait in lockstep: all that a fault of the plant holds back, 10 s at 10 kHz, if it lets go at once."""
+
 PATIENCE: Final = 0.5  # share of a period by which a frame may be later than the fastest before its tick is silent
 
 
@@ -76,9 +79,7 @@ class TickSource:
         """An empty frame in lockstep, or a malformed one, which counts as the measurement that was due."""
         if self._sparse:
             return PlantTick(self.tick, arrival.frame, Received.MALFORMED, arrival.at_ns)
-        tick = self.tick + 1
-        if self._lockstep:
-            self._ticks.tick = tick
+        tick = self._ticks.advance_one() if self._lockstep else self.tick + 1
         empty = arrival.frame == UNCHANGED and self._lockstep
         return self._as_tick(tick, arrival, Received.SILENT if empty else Received.MALFORMED, 0, fresh=empty)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
 from aeroloop.protocol.messages.models import Status
@@ -34,6 +34,16 @@ class Trouble(NamedTuple):
     text: str
 
 
+def lacking_recorder(roles: Mapping[str, Status]) -> str | None:
+    """Why a vehicle's recorder is missed, after the vehicle's name; None if it is not."""
+    lacking = {status.lacks_recorder for status in roles.values()}
+    if "gone" in lacking:
+        return "'s recorder is gone: it was there, and did not stop in order"
+    if "required" in lacking:
+        return " has no recorder, and its controller requires one (controller.require_recorder)"
+    return None
+
+
 def troubles(found: Gathered) -> list[Trouble]:
     """Everything that is wrong, by vehicle and role; of one role the gravest."""
     wrong: list[Trouble] = []
@@ -43,13 +53,9 @@ def troubles(found: Gathered) -> list[Trouble]:
                 wrong.append(Trouble("missing", vehicle, role, f"{vehicle} has no {role}"))
             else:
                 wrong += list(_of_role(vehicle, role, roles[role]))[:1]
-        lacking = {status.lacks_recorder for status in roles.values()}
-        if "gone" in lacking:
-            text = f"{vehicle}'s recorder is gone: it was there, and did not stop in order"
-            wrong.append(Trouble("missing", vehicle, "recorder", text))
-        elif "required" in lacking:
-            text = f"{vehicle} has no recorder, and its controller requires one (controller.require_recorder)"
-            wrong.append(Trouble("missing", vehicle, "recorder", text))
+        why = lacking_recorder(roles)
+        if why is not None:
+            wrong.append(Trouble("missing", vehicle, "recorder", f"{vehicle}{why}"))
     return wrong + [Trouble("silent", None, None, line) for line in found.silent]
 
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.config import Settings, load_over
+from aeroloop.service.config import Settings, load_over, vouched
 from aeroloop.service.lab.experiment import run_experiment
 
 Result = TypeVar("Result")
@@ -70,7 +70,7 @@ class Run(NamedTuple):
 
 @lru_cache(maxsize=2)
 def _base(config: str) -> Settings:
-    return Settings.model_validate_json(config)
+    return vouched(Settings.model_validate_json(config))  # of the user who runs the study, in another process
 
 
 def run_of(settings: Settings, overrides: Sequence[str] = (), seed: int | None = None) -> Run:

@@ -7,10 +7,11 @@ clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same f
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import closing
 from math import nan
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from aeroloop.service.lab.loop_function import Course, loop_of
 
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
 
+BYTES_A_TICK: Final = 600
+"""Memory that an experiment takes for each tick: inputs, outputs and errors, each column and its copies."""
+
 Watch: TypeAlias = Callable[[int, bytes, bytes], None]
 """Called at every tick with k, the measurement and the command that answers it; UNCHANGED where none is sent."""
 
@@ -38,11 +42,15 @@ class LoopEndedError(ValueError):
 
     Attributes:
         after_s: The time [s].
+        causes: Why, a line each.
     """
 
     def __init__(self, after_s: float, causes: list[str]) -> None:
-        super().__init__(f"the loop ended after {after_s:g} s: {'; '.join(causes) or 'no answer'}")
-        self.after_s = after_s
+        super().__init__(after_s, causes)  # as they are, so that a worker process can hand it over
+        self.after_s, self.causes = after_s, causes
+
+    def __str__(self) -> str:
+        return f"the loop ended after {self.after_s:g} s: {'; '.join(self.causes) or 'no answer'}"
 
 
 class Experiment(NamedTuple):
@@ -77,9 +85,11 @@ def experiment(
             `max_reference_tilt_deg`, or rolls a vehicle that cannot.
         LoopEndedError: The plant tripped.
         PluginError, PlantError: The configured plant is not there, or failed.
-        ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
+        ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2; or the run is too
+            long for this machine's memory.
     """
     Trajectory.of(settings.reference).check(Limits.of(settings.controller, settings.wire.actuators))
+    _check_length(settings, duration_s)
     if watch is None and plant is None and controller is None:
         course = _as_one_function(settings, duration_s, progress)
         if course is not None:
@@ -93,6 +103,17 @@ def experiment(
         return _through_frames(settings, duration_s, progress, watch, plant, controller)
     with closing(settings.plant.make(settings.loop.period)) as made:  # 0 V at the end: it may be a machine
         return _through_frames(settings, duration_s, progress, watch, made, controller)
+
+
+def _check_length(settings: Settings, duration_s: float) -> None:
+    """Raise ValueError if the columns of a run would not fit into this machine's memory."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    longest_s = memory / BYTES_A_TICK * settings.loop.period
+    if duration_s > longest_s:
+        raise ValueError(
+            f"a run of {duration_s:g} s at {settings.loop.rate_hz:g} Hz does not fit into this machine's memory: "
+            f"{longest_s:.1g} s or less would"
+        )
 
 
 def run_experiment(
@@ -171,7 +192,9 @@ def _through_frames(
     both = LockstepLoop(endpoint, controller, endpoint.tick(None, 0))
     for k in range(loop.ticks(duration_s)):
         measurement = both.measurement
-        command = next((one.command for one in both.answer()), None)
+        command: bytes | None = None
+        for answered in both.answer():
+            command = answered.command
         if measurement is None or command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
             raise LoopEndedError(k * loop.period, trips if controller.fault is None else [controller.fault])

@@ -2,8 +2,9 @@
 
 Both ends are computed again up to the plant's measurement of that tick, from what they received; from there on the loop
 closes in this process. What came from outside, such as an operator's later gains, references, faults and stop, acts as
-recorded unless the fork replaces it; releases and lost sessions do not. So a fork with no change repeats a lockstep
-log, and a real-time one up to the first tick at which the network lost or delayed a frame.
+recorded unless the fork replaces it; releases and lost sessions do not. Frames that an injected fault holds back are
+in flight at that instant, too: the controller goes on with the measurement that reaches it next. So a fork with no
+change repeats a lockstep log, and a real-time one up to the first tick at which the network lost or delayed a frame.
 """
 
 from __future__ import annotations
@@ -15,29 +16,35 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.trace import PlantReplay, cut, plant_row
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Change, Gains, in_force
 from aeroloop.protocol.messages.trace import (
     ENDS,
+    Batch,
     End,
     PlantChange,
     Received,
     Sent,
 )
+from aeroloop.protocol.wire.frames import TickCounter
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.registry import gains_of, law_class, with_gains
 from aeroloop.service.control.motion import Approach, shortest
 from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.figures import Figures
-from aeroloop.service.lab.lockstep import LockstepLog, LockstepLoop
+from aeroloop.service.lab.lockstep import LockstepLog, LockstepLoop, tick_of
 from aeroloop.service.logs.frames import Direction
+from aeroloop.service.logs.mcap_file import FORK_METADATA
 from aeroloop.service.logs.outputs import check_output, writing_into
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
@@ -127,13 +134,14 @@ def fork(
     last = recorded.extent.last["controller"]
     if not 0 <= tick <= last:
         raise ForkError(f"the session has ticks 0 to {last}, up to {last * period:g} s, and none {tick}")
+    _check_known(recorded, tick)
     settings = load_over(recorded.settings, overrides) if overrides else recorded.settings
     until = last if duration_s is None else tick + max(1, round(duration_s / settings.loop.period)) - 1
-    plant, later = _plant_at(recording, recorded, settings, tick, report)
-    its = _Changes(recorded, settings, tick, overrides)
+    instant = _plant_at(recording, recorded, settings, tick, report)
+    its = _Changes(recorded, settings, instant.next_tick, overrides)
     if faults:
-        plant.endpoint.inject([Fault.parse(text) for text in faults])
-    differed, where = plant.result().first_difference, None
+        instant.plant.endpoint.inject([Fault.parse(text) for text in faults])
+    differed, where = instant.plant.result().first_difference, None
     if differed is not None:
         where = f"the plant, computed again, differs from the log from tick {differed.session_tick} on"
     with ExitStack() as stack:
@@ -141,13 +149,19 @@ def fork(
             out = Path(stack.enter_context(TemporaryDirectory())) / "fork.mcap"
         else:
             out = stack.enter_context(writing_into(log.parent, paths)) / log.name
-        begun = stack.enter_context(closing(_begin_log(out, recording, recorded, its)))
-        ended = _run(begun, its, plant, later, until, lambda share: report(REPLAYED + 0.3 * share))
-        forked, found = _of(read(out), log), Recording([out]).session(which)
-        end_s = (until + 0.5) * settings.loop.period
-        known = read(*paths, session="/".join(which), since_s=tick * period, until_s=end_s)
+        begun = stack.enter_context(closing(_begin_log(out, recording, recorded, its, instant, tick)))
+        ended = _run(begun, its, instant, tick, until, lambda share: report(REPLAYED + 0.3 * share))
+        begin_s = tick * period
+        in_flight = instant.next_tick < tick  # measurements of before the instant are answered after it
+        forked = _of(read(out, since_s=begin_s) if in_flight else read(out), log)
+        found = Recording([out]).session(which)
+        # The fork may have ended before the recorded run, or have no valid value: both are judged up to the same tick.
+        last_judged = int(forked.ticks.k[-1]) if len(forked.ticks.k) else tick
+        end_s = (last_judged + 0.5) * settings.loop.period
+        known = read(*paths, session="/".join(which), since_s=begin_s, until_s=end_s)
     same_wire = (recorded.settings.loop, recorded.settings.wire) == (settings.loop, settings.wire)
-    parts, compared, network = _parting(recorded, found, tick) if same_wire else (None, 0, None)
+    first: dict[End, int] = {"plant": tick, "controller": instant.next_tick}
+    parts, compared, network = _parting(recorded, found, first) if same_wire else (None, 0, None)
     report(1.0)
     return Fork(tick, tick * period, [*overrides, *faults], parts, compared, network, ended, where, log, forked, known)
 
@@ -165,10 +179,59 @@ def _of(forked: Review, log: Path | None) -> Review:
 # ── both ends at the instant ──
 
 
-def _plant_at(
-    recording: Recording, recorded: Session, settings: Settings, tick: int, report: Progress
-) -> tuple[PlantReplay, deque[PlantChange]]:
-    """The plant end after its measurement of a tick, and the changes after it that came from outside."""
+def _check_known(recorded: Session, tick: int) -> None:
+    """Raise ForkError unless the log holds what was in force at a tick, and the law's state."""
+    for unknown in recorded.unknown:
+        if unknown.first_tick <= tick <= unknown.last_tick:
+            raise ForkError(f"tick {tick} cannot be forked: {unknown}")
+    for gap in recorded.missing:
+        last_tick = tick if gap.last_tick is None else gap.last_tick
+        if gap.end == "controller" and gap.rows and gap.first_tick < tick <= last_tick:
+            raise ForkError(f"tick {tick} cannot be forked: the log lacks {gap}")
+
+
+class _InFlight:
+    """Ticks of the measurements that have left a plant, as its controller counts them, while it is computed again.
+
+    `reached` is the tick of the last one that had left before the plant's present tick, −1 for none; `next_tick` is
+    that of the first one that leaves then, or is due next.
+    """
+
+    def __init__(self, wire: WireSpec, loop: LoopSettings) -> None:
+        self._layout, self._lockstep = wire.measurement, loop.lockstep
+        self._ticks = TickCounter(loop.period_ns, self._layout.counters, lockstep=True)
+        self.reached = -1
+        self.next_tick = 0
+
+    def follow(self, endpoint: Endpoint) -> None:
+        """The plant has ticked."""
+        if endpoint.session_tick == 0:
+            self._ticks.tick = -1  # another session
+        self.reached = self._ticks.tick
+        left = list[int]()
+        for frame in endpoint.outgoing:
+            if frame == UNCHANGED and not self._lockstep:  # no frame: the controller takes the tick that is over
+                self._ticks.tick = max(self._ticks.tick, endpoint.session_tick)
+                left.append(self._ticks.tick)
+                continue
+            tick = tick_of(self._ticks, self._layout, frame)
+            if tick is not None:
+                left.append(tick)
+        self.next_tick = left[0] if left else self.reached + 1
+
+
+class _Instant(NamedTuple):
+    """The plant end after its measurement of a tick, and what comes after it."""
+
+    plant: PlantReplay
+    later: deque[PlantChange]  # that came from outside
+    reached: int  # tick of the last measurement that the controller has received by then, −1 for none
+    next_tick: int  # tick of the measurement that it receives next
+    at_ns: int  # when that tick was measured, on the plant's wall clock [ns since 1970]
+
+
+def _plant_at(recording: Recording, recorded: Session, settings: Settings, tick: int, report: Progress) -> _Instant:
+    """The instant at which the plant end has measured a tick."""
     vehicle, session = recorded.which
     processes = [
         (description, batches)
@@ -185,20 +248,23 @@ def _plant_at(
     ]
     try:
         if another and not tick:
-            return _plant_anew(batches, session, settings), deque()
+            return _plant_anew(batches, session, settings)
         if wrong := [name for name in another if name != "plant"]:
             raise ForkError(f"{wrong[0]}.* holds from the session's start: fork it --at 0")
-        plant = PlantReplay(was.loop, was.wire, was.plant)
+        in_flight = _InFlight(was.wire, was.loop)
+        plant = PlantReplay(was.loop, was.wire, was.plant, in_flight.follow)
     except ValueError as error:
         raise ForkError(str(error)) from None
     left, later = sum(batch.header.rows for batch in batches), deque[PlantChange]()
-    rows, found = max(1, left), False
+    rows, found, at_ns = max(1, left), False, 0
     for batch in batches:
         ticks = batch.columns["session_tick"]
         wanted = int(np.searchsorted(ticks, tick, "right")) if batch.header.session == session else len(ticks)
         if not found:
             found = batch.header.session == session and wanted > 0 and int(ticks[wanted - 1]) == tick
             plant.feed(cut(batch, wanted) if found else batch)
+            if found:
+                at_ns = _measured_ns(batch, wanted - 1)
             left -= batch.header.rows
             report(0.5 + (REPLAYED - 0.5) * (1 - left / rows))
         if found:
@@ -211,10 +277,19 @@ def _plant_at(
             plant.endpoint.plant = settings.plant.continued(plant.endpoint.plant, was.plant, was.loop.period)
         except ValueError as error:
             raise ForkError(f"{error}: fork it --at 0") from None
-    return plant, deque(change for change in later if change.tick >= ticked)
+    after = deque(change for change in later if change.tick >= ticked)
+    return _Instant(plant, after, in_flight.reached, in_flight.next_tick, at_ns)
 
 
-def _plant_anew(batches: Sequence[Any], session: str, settings: Settings) -> PlantReplay:
+def _measured_ns(batch: Batch, row: int) -> int:
+    """When a row of a plant's batch was measured, on its wall clock [ns since 1970]."""
+    if not 0 <= row < batch.header.rows:
+        return batch.header.wall_ns
+    sent_ns = int(batch.times_ns("sent")[row])
+    return batch.header.wall_ns + max(0, sent_ns - batch.header.monotonic_ns)
+
+
+def _plant_anew(batches: Sequence[Batch], session: str, settings: Settings) -> _Instant:
     """A plant end with other settings at the first measurement of a session, which must be its first."""
     plant = PlantReplay(settings.loop, settings.wire, settings.plant)
     for batch in batches:
@@ -231,7 +306,7 @@ def _plant_anew(batches: Sequence[Any], session: str, settings: Settings) -> Pla
                 plant.apply(change.model_copy(update={"claim": claim}))
                 measurement = plant.endpoint.tick(None, plant.endpoint.ticked + 1)
                 plant.last = plant_row(plant.endpoint, measurement, None, 0)
-                return plant
+                return _Instant(plant, deque(), -1, 0, _measured_ns(batch, 0))
         if batch.header.rows:
             raise ForkError(
                 "another plant, wire or loop holds from the plant's start, and the session is not its first"
@@ -266,8 +341,10 @@ class _Changes:
         if tick:
             logged, rows = LoggedController(recorded), recorded.controller
             later = (rows["tick"] >= tick) & np.isin(rows["received_as"], (Received.FRAME, Received.SILENT))
-            for _ in islice(logged.answers(), int(np.argmax(np.append(later, True)))):
+            first_later = int(np.argmax(np.append(later, True)))
+            for _ in islice(logged.answers(), first_later):
                 pass
+            logged.resume(first_later)  # where the rows before it are missing
             self.controller.restore(logged.controller.state)
         own = Change(session=self.name, tick=tick, gains=Gains.model_validate(given) if given or another else None)
         if follows:
@@ -295,12 +372,13 @@ class _Changes:
 # ── the rest of the run ──
 
 
-def _begin_log(path: Path, recording: Recording, recorded: Session, its: _Changes) -> LockstepLog:
+def _begin_log(
+    path: Path, recording: Recording, recorded: Session, its: _Changes, instant: _Instant, tick: int
+) -> LockstepLog:
     """The fork's log, which begins at the wall time of its tick on the recorded plant's clock."""
-    place = min(int(np.searchsorted(recorded.plant["session_tick"], its.tick)), len(recorded.plant) - 1)
-    begin_ns = int(recorded.plant["sent"][place] + recorded.plant["wall"][place])
     described = recording.described(recorded.which)
-    log = LockstepLog(path, its.settings, recorded.which, its.tick, begin_ns)
+    log = LockstepLog(path, its.settings, recorded.which, tick, instant.at_ns)
+    log.add_metadata(FORK_METADATA, tick=tick, session="/".join(recorded.which), logs=[*map(str, recording.paths)])
     changed = {} if its.settings == recorded.settings else {"certificate": None}
     for end in ENDS:
         log.describe((described.get(end) or described["plant"]).model_copy(update={"role": end, **changed}))
@@ -308,14 +386,13 @@ def _begin_log(path: Path, recording: Recording, recorded: Session, its: _Change
     return log
 
 
-def _run(
-    log: LockstepLog, its: _Changes, plant: PlantReplay, later: deque[PlantChange], until: int, report: Progress
-) -> str | None:
+def _run(log: LockstepLog, its: _Changes, instant: _Instant, tick: int, until: int, report: Progress) -> str | None:
     """Run both ends from the instant up to a tick. Returns why it ended before."""
-    endpoint, controller, tick = plant.endpoint, its.controller, its.tick
+    plant, later, controller = instant.plant, instant.later, its.controller
+    endpoint = plant.endpoint
     assert plant.last is not None
     log.plant(plant.last, endpoint)
-    loop, ended = LockstepLoop(endpoint, controller, plant.last.measurement, tick - 1, its.before), None
+    loop, ended = LockstepLoop(endpoint, controller, plant.last.measurement, instant.reached, its.before), None
     for k in range(tick, until + 1):
         command: bytes | None = None
         for one in loop.answer():
@@ -339,14 +416,18 @@ def _run(
     return ended
 
 
-def _parting(recorded: Session, forked: Session, first: int) -> tuple[Parting | None, int, int | None]:
-    """The first tick from `first` on at which what an end sent differs, and how many ticks both have.
+def _parting(recorded: Session, forked: Session, first_ticks: dict[End, int]) -> tuple[Parting | None, int, int | None]:
+    """The first tick at which what an end sent differs, of each end from its first on, and how many ticks both have.
 
     And the first tick at which the plant acted on another measurement's answer, which in the fork the network decides.
     """
-    last, found = min(max(one.extent.last.values()) for one in (recorded, forked)), list[Parting]()
+    found, compared = list[Parting](), list[int]()
     ends: tuple[tuple[End, Direction], ...] = ("plant", "measurement"), ("controller", "command")
     for end, direction in ends:
+        first, last = first_ticks[end], min(session.extent.last[end] for session in (recorded, forked))
+        compared.append(max(0, last + 1 - first))
+        if not compared[-1]:
+            continue
         one, other = (_sent(each, end, direction, first, last) for each in (recorded, forked))
         differ = (one[0] != other[0]) | ((one[0] == Sent.FRAME) & (one[1] != other[1]))
         if differ.any():
@@ -354,9 +435,9 @@ def _parting(recorded: Session, forked: Session, first: int) -> tuple[Parting | 
             sides = (int(one[0][i]), one[1][i]), (int(other[0][i]), other[1][i])
             found.append(Parting(end=end, **dict(tick_difference(recorded.settings, direction, first + i, *sides))))
     acted = (one.plant[["session_tick", "answered"]] for one in (recorded, forked))
-    of_one, of_other = (dict(rows[rows["session_tick"] > first].tolist()) for rows in acted)
+    of_one, of_other = (dict(rows[rows["session_tick"] > first_ticks["plant"]].tolist()) for rows in acted)
     network = next((k for k, answered in of_one.items() if of_other.get(k, answered) != answered), None)
-    return min(found, key=lambda each: each.tick, default=None), last + 1 - first, network
+    return min(found, key=lambda each: each.tick, default=None), min(compared), network
 
 
 def _sent(session: Session, end: End, direction: Direction, first: int, last: int) -> tuple[Integers, Any]:

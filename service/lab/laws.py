@@ -21,7 +21,8 @@ from aeroloop.protocol.wire.spec import SignalBits
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.baselines import TUNED, NonadaptiveSettings, Response, response_of, tuned
-from aeroloop.service.control.laws.interface import EstimateSettings
+from aeroloop.service.control.laws.interface import EstimateSettings, PythonLaw
+from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.lab.engine import PROCESSES, Progress, Row, Sheets, cell, figures_row, open_workers, run_of
 from aeroloop.service.lab.margins import LONGEST_S, WITHIN_DEG, survived
 from aeroloop.service.theorem.certificate import certify
@@ -56,6 +57,12 @@ def compared_laws(settings: Settings, laws: Sequence[str] = ()) -> dict[str, lis
     for overrides in found.values():
         with_law_settings(load_over(settings, overrides))
     return found
+
+
+def laws_in_python(settings: Settings, laws: Mapping[str, Sequence[str]]) -> list[str]:
+    """Names of those laws that are plain Python, and so run tick by tick."""
+    classes = {name: law_class(load_over(settings, overrides).law) for name, overrides in laws.items()}
+    return [name for name, law in classes.items() if issubclass(law, PythonLaw)]
 
 
 def _law(settings: Settings, name: str) -> dict[str, Any]:

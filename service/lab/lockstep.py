@@ -8,9 +8,10 @@ answer. `LockstepLog` writes what happened as the recorder does, so every reader
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from json import dumps
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, NamedTuple
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.protocol.messages import topics
@@ -28,13 +29,18 @@ from aeroloop.protocol.messages.trace import (
 )
 from aeroloop.protocol.transport.history import Delivery
 from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.frames import FrameFormat, TickCounter
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.logs.session import SessionKey
 from aeroloop.service.recording.rolling import LogFile
 
-OLD: Final = 0.75  # of a counter's range: a frame that seems so far ahead is a repetition, or older than the last one
+
+def tick_of(ticks: TickCounter, layout: FrameFormat, frame: bytes) -> int | None:
+    """The tick of a measurement that is received in lockstep; None of a repeated or older one."""
+    counter = layout.counter(frame)
+    return ticks.advance_one() if counter is None else ticks.advance(counter, 0)
 
 
 class Answered(NamedTuple):
@@ -49,33 +55,36 @@ class Answered(NamedTuple):
 class LockstepLoop:
     """A controller and a plant end that has taken a measurement which the controller has not received.
 
-    `k` is the tick of the last measurement received; `measurement` is the plant's last one, as `Endpoint.tick` returned
-    it. `before` is called before the controller's tick k, to change gains or reference.
+    `k` is the tick of the last measurement that it has received; `measurement` is the plant's last one, as
+    `Endpoint.tick` returned it. `before` is called before the controller's tick k, to change gains or reference.
     """
 
     def __init__(
         self, endpoint: Endpoint, controller: Controller, measurement: bytes | None, k: int = -1,
         before: Callable[[int], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        self.endpoint, self.controller, self.measurement, self.k = endpoint, controller, measurement, k
+        self.endpoint, self.controller, self.measurement = endpoint, controller, measurement
+        counters = endpoint.wire.measurement.counters
+        self._ticks = TickCounter(endpoint.period_ns, counters, lockstep=True, tick=k)
         self._before = before
 
-    def answer(self) -> list[Answered]:
-        """The controller's answers to what the plant has sent: one, or what faults of frames leave, in order."""
-        wire, answered = self.endpoint.wire, list[Answered]()
-        counters = wire.measurement.counters
+    def answer(self) -> Iterator[Answered]:
+        """The controller's answers to what the plant has sent: one, or what faults of frames leave, in order.
+
+        Each is computed when it is asked for: between two of them the controller is as it was after the first.
+        """
+        layout = self.endpoint.wire.measurement
         for frame in self.endpoint.outgoing:
-            counter = wire.measurement.counter(frame)
-            ahead = 1 if counter is None else (counter - self.k) % counters
-            if ahead == 0 or ahead > OLD * counters:
+            k = tick_of(self._ticks, layout, frame)
+            if k is None:
                 continue
-            self.k += ahead
-            received_as = Received.FRAME if counter is not None else Received.MALFORMED
+            received_as = Received.FRAME
             if frame == UNCHANGED:
                 received_as = Received.SILENT
-            self._before(self.k)
-            answered.append(Answered(self.k, received_as, frame, self.controller.tick(frame, self.k)))
-        return answered
+            elif layout.counter(frame) is None:
+                received_as = Received.MALFORMED
+            self._before(k)
+            yield Answered(k, received_as, frame, self.controller.tick(frame, k))
 
     def advance(self, command: bytes | None) -> Arrival | None:
         """The plant acts on a command, if any, for a period, and measures. Returns what it received."""
@@ -107,14 +116,19 @@ class LockstepLog:
         key = topics.key("description", self._vehicle, role=role.role)
         self._file.add_description(key, role.model_copy(update={"config": config}).encode())
 
+    def add_metadata(self, name: str, **entries: Any) -> None:
+        """Add a metadata record, of entries that are JSON."""
+        self._file.add_metadata(name, json=dumps(entries))
+
     def begin(self, controller: Controller, in_force: Sequence[Change]) -> None:
         """Begin with the controller's state, and with the gains and the reference in force."""
         for writer in self._writers.values():
             writer.session, writer.record = self._session, record_json(in_force)
+        self._controller = controller
         self._writers["controller"].state = controller.state.model_dump(mode="json")
 
     def controller(self, one: Answered, changes: Sequence[Change]) -> None:
-        """Add a tick of the controller, and the changes before it."""
+        """Add the tick that the controller has just computed, and the changes before it."""
         self._writers["controller"].changes += changes
         sent_as = Sent.NONE if one.command is None else Sent.FRAME if one.command else Sent.SILENT
         at_ns, command = self._at_ns(one.k), one.command or b""
@@ -159,6 +173,8 @@ class LockstepLog:
 
     def _publish(self, end: End, k: int, *, final: bool = False) -> None:
         self._add("trace", end, self._writers[end].take(self._at_ns(k), self._at_ns(k), final=final), k)
+        if end == "controller":
+            self._writers[end].state = self._controller.state.model_dump(mode="json")  # before the next batch's rows
 
     def _add(self, topic: str, role: str, payload: bytes, k: int) -> None:
         at_ns = self._at_ns(k)

@@ -44,6 +44,7 @@ class Exported(BaseModel, frozen=True):
     damages: list[str] = Field(description="what of the log could not be read")
     unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
     left_out: list[str] = Field(default=[], description="other sessions of the log that the table does not have")
+    law_unknown: str | None = Field(default=None, description="why the table lacks the law's own columns, if it does")
     around: list[str] = Field(default=[], description="events that `around` names; the export is around the first")
 
 

@@ -24,7 +24,7 @@ from aeroloop.service.logs.copies import Exported, ExportError, beside, events_n
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.session import SessionKey
-from aeroloop.service.logs.ticks import recompute
+from aeroloop.service.logs.ticks import recompute, with_known_law
 
 Format = Literal["parquet", "csv"]
 
@@ -71,7 +71,7 @@ def export(
                 event, which = events[0]
                 at_s = (event.tick or 0) * recording.settings(which).loop.period
                 since_s, until_s = at_s - around[1], at_s + around[1]
-            rows, columns = _write_table(recording, to, part, which, (since_s, until_s))
+            rows, columns, law_unknown = _write_table(recording, to, part, which, (since_s, until_s))
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
@@ -80,15 +80,18 @@ def export(
         damages=recording.unread,
         unknown=[one for one in recording.unknown if (one.vehicle, one.session) == which],
         left_out=["/".join(other) for other in recording.extents if other != which],
-        around=[one.text for one, _ in events],
+        law_unknown=law_unknown, around=[one.text for one, _ in events],
     )  # fmt: skip
 
 
 def _write_table(
     recording: Recording, to: Format, part: Path, which: SessionKey, times_s: tuple[float, float]
-) -> tuple[int, list[str]]:
-    """Write a table, some rows at a time; returns its number of rows and its columns' names."""
-    session = recording.session(which, *times_s)
+) -> tuple[int, list[str], str | None]:
+    """Write a table, some rows at a time.
+
+    Returns its number of rows, its columns' names, and why it lacks those of the law, if it does.
+    """
+    session, law_unknown = with_known_law(recording.session(which, *times_s))
     truths = recording.true_states(which, session.settings.wire.actuators)
     ticks = recompute(session).ticks
     if not len(ticks.k):
@@ -117,7 +120,7 @@ def _write_table(
         for piece in pieces:
             columns = columns_of(which, piece, truths, session.settings)
             writer.write_batch(pa.RecordBatch.from_arrays([*map(_array, columns)], schema.names).cast(schema))
-    return len(ticks.k), schema.names
+    return len(ticks.k), schema.names, law_unknown
 
 
 def _array(column: Column) -> Any:

@@ -35,6 +35,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 DESCRIPTION_METADATA: Final = "aeroloop.description"  # a role's description as JSON under `json`, its key under `key`
+FORK_METADATA: Final = "aeroloop.fork"  # of a fork's log: which session was forked, at which tick
 RECORDER_METADATA: Final = "aeroloop.recorder"  # about the file: its run, the recording's identity, its part, its start
 CHUNK_BYTES: Final = 64 * 1024  # compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once
 MAX_CHUNK: Final = 16 << 20  # bytes of a record, or of what a chunk holds: a forged size costs no memory

@@ -145,6 +145,10 @@ class Recording:
             if one.first <= last and one.last >= first
             if not any(gap.first_tick <= one.last <= gap.last_tick for gap in unknown)
         ]
+        begin = parts["controller"].index(computed[0]) if computed else 0
+        while computed and not computed[0].has_state and begin:  # computed from the last state that the log has
+            begin -= 1
+            computed.insert(0, parts["controller"][begin])
         payloads = self._index.payloads
         acting = [one for one in parts["plant"] if one.first <= acted and one.last >= first]
         controller, states, left_out = table_of("controller", settings.wire, computed, payloads)

@@ -20,6 +20,7 @@ from aeroloop.plant_emulator.hosts.trace import PlantReplay, PlantReplayed, why_
 from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.trace import ENDS, End, Sent
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Controller
@@ -264,6 +265,10 @@ def _replay_plants(
     Returns the result of each process, the reason if there is none or one ends early, and which rows are not compared.
     """
     results, reasons, unseen = list[PlantReplayed](), list[str](), list[str]()
+    forked = recording.metadata.get("fork")
+    if forked is not None:
+        tick = forked.get("tick", "?")
+        return [], f"a fork's plant begins in flight, at tick {tick}: only the log that was forked has its state", []
     plants = list(recording.plants())
     done, total = 0, max(1, sum(batch.header.rows for *_, batches in plants for batch in batches))
     for source, description, batches in plants:
@@ -272,12 +277,12 @@ def _replay_plants(
             reason = f"the log has no description of {source.vehicle}'s plant"
         else:
             its = from_description(description.config)
-            if (why := why_not(its.plant)) is not None:  # no log of it could be compared
-                reasons.append(why)
-                continue
             try:
+                if (why := why_not(its.plant)) is not None:  # no log of it could be compared
+                    reasons.append(why)
+                    continue
                 one = PlantReplay(its.loop, its.wire, its.plant)
-            except PlantError as error:
+            except (PlantError, PluginError) as error:
                 reason = str(error)
             else:
                 for batch in batches:

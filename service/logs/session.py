@@ -122,6 +122,7 @@ class Entry(NamedTuple):
     proof: int  # a tick of the other end whose row there must be
     changes: list[Change]
     record: list[Change]
+    has_state: bool  # of the controller, before the first row; a session's first row needs none
 
     @property
     def after(self) -> int:
@@ -157,7 +158,10 @@ class TraceIndex:
             record = tail.record if all(change.session == session for change in tail.record) else []
             place = slice(len(self.payloads), len(self.payloads) + len(payload))
             self.payloads += payload
-            self.entries[source].append(Entry(header, place, published_ns, *_ticks(batch), changes, record))
+            first, last, proof = _ticks(batch)
+            has_state = tail.state is not None or first == 0
+            entry = Entry(header, place, published_ns, first, last, proof, changes, record, has_state)
+            self.entries[source].append(entry)
         return {source, (vehicle, session)} if session else {source}
 
     def finish(self) -> None:
@@ -252,7 +256,7 @@ class TraceIndex:
             first, last = rows[0].first, max(entry.last for entry in rows)
             recorded.append((first, last))
             since = min((max(a, first) for a, b in proven if a <= last and b >= first), default=last + 1)
-            since = next((entry.first for entry in rows if entry.first >= since), last + 1)
+            since = next((entry.first for entry in rows if entry.first >= since and entry.has_state), last + 1)
             known.append((since, last))
         extent = self.extents[which]
         begin = min(extent.first[end] for end in ENDS if extent.rows[end])

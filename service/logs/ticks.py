@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
@@ -20,13 +21,21 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import Received, Sent
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import CodedQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.control.laws.registry import configured_gains, law_of
+from aeroloop.service.control.laws.registry import (
+    LawError,
+    UnknownLawSettings,
+    configured_gains,
+    law_function,
+    law_of,
+    no_such_gain,
+)
 from aeroloop.service.logs.recording import Progress, ReviewError
 from aeroloop.service.logs.session import Array, Integers, Places, Session, Table
 
@@ -88,7 +97,7 @@ class LoggedController:
 
     With other `settings` than the session's, parts of the logged changes may be `ignored`. It `resumes` from the
     recorded state where rows are missing. `made_by` is the class of its controller. `state_before` is the law's state
-    before the last row.
+    before the last row. Of a session as of `with_known_law` whose law is unknown, it computes all but the law.
     """
 
     def __init__(
@@ -107,6 +116,9 @@ class LoggedController:
         self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
         self._changes: deque[Change] = deque(session.changes)
         self._ignored: dict[str, None] = dict.fromkeys(ignored)
+        if isinstance(settings.law, UnknownLawSettings):
+            self.controller.leave_out_law()
+            self._ignored["gains"] = None
 
     def answers(self, progress: Progress | None = None) -> Iterator[bytes | None]:
         """The command that answers each row: a frame, UNCHANGED, or None. Raises ReviewError as `resume`."""
@@ -140,6 +152,27 @@ class LoggedController:
             except ValidationError as error:
                 why = str(error).splitlines()[0]
                 raise ReviewError(f"the log has a state that is not of this version: {why}") from None
+
+
+def with_known_law(session: Session) -> tuple[Session, str | None]:
+    """The session, as it can be computed here, and why its law cannot be had, if so: None if it can.
+
+    Without its law, a session's attitude, errors, voltages and times are known, but not what the law alone computes:
+    voltages before quantization, gains and state.
+    """
+    settings = session.settings
+    try:
+        law = law_of(settings.law, settings.loop.period, settings.wire.actuators)
+        law_function(law)
+        sizes = {name: len(gain) for name, gain in configured_gains(law).items()}
+        for change in session.changes:
+            for name, gain in change.gains.named.items() if change.gains is not None else ():
+                if sizes.get(name) != len(gain):
+                    raise no_such_gain(settings.law.kind, name, len(gain))
+    except (LawError, PluginError) as error:
+        unknown = UnknownLawSettings.model_validate(settings.law.model_dump())
+        return replace(session, settings=settings.model_copy(update={"law": unknown})), str(error)
+    return session, None
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -250,7 +283,8 @@ def _gains(session: Session, k: Integers) -> Array:
     """The gains in force at each tick k, one beside the other. Shape (n, gains)."""
     settings = session.settings
     gains = configured_gains(law_of(settings.law, settings.loop.period, settings.wire.actuators))
-    changes = [change for change in session.changes if change.gains is not None]
+    known = not isinstance(settings.law, UnknownLawSettings)
+    changes = [change for change in session.changes if known and change.gains is not None]
     sets = [list(gains.values())]
     for change in changes:
         assert change.gains is not None

@@ -78,10 +78,11 @@ def durations(runs: Sequence[Findings]) -> list[Duration]:
 
 
 def missing(run: Findings) -> list[str]:
-    """What of the log is damaged, was not recorded, is unknown, or was lost by the recorder."""
+    """What of the log is damaged, was not recorded, is unknown, or was lost by the recorder, or its law's."""
     lacks = [f"not recorded: {gap}" for gap in run.missing]
     lost = [f"the recorder lost {count(n, 'message')} of {topic}" for topic, n in run.losses.items()]
-    return [*run.damages, *lacks, *map(str, run.unknown), *lost]
+    of_law = [] if run.law_unknown is None else [f"without its law: {run.law_unknown}"]
+    return [*run.damages, *lacks, *map(str, run.unknown), *lost, *of_law]
 
 
 def theorem_sentences(run: Findings) -> list[tuple[bool | None, str]]:

@@ -25,7 +25,7 @@ from aeroloop.service.control.laws.registry import configured_gains, initial_sta
 from aeroloop.service.logs.columns import Column, columns_of
 from aeroloop.service.logs.frames import Direction, FrameSignal, read_frame
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.ticks import recompute
+from aeroloop.service.logs.ticks import recompute, with_known_law
 from aeroloop.service.review.events import happened, read_messages
 from aeroloop.service.review.report import Mark
 from aeroloop.service.theorem.bounds import coordinates, norm, rotation, times
@@ -72,7 +72,10 @@ class Instant(BaseModel, frozen=True):
 
 
 class Instants:
-    """A session of a log, read once. Raises ReviewError as `Recording` does."""
+    """A session of a log, read once. Raises ReviewError as `Recording` does.
+
+    `law_unknown` is why nothing is known that the law alone computes; None if it is.
+    """
 
     def __init__(
         self, paths: Sequence[Path], session: str | None = None, vehicle: str | None = None,
@@ -80,7 +83,8 @@ class Instants:
     ) -> None:  # fmt: skip
         recording = Recording(paths, progress)
         self.which = recording.choose(session, vehicle)
-        self._session = its = recording.session(self.which)
+        its, self.law_unknown = with_known_law(recording.session(self.which))
+        self._session = its
         self.settings, self._period = its.settings, its.settings.loop.period
         if not len(its.k):
             raise ReviewError(f"{recording.name} holds no tick of {'/'.join(self.which)}")
@@ -160,7 +164,7 @@ class Instants:
             state_after=_split(self._state, self._ticks.state_next[i]) if valid else {},
             coordinates=self._coordinates(i) if valid else {},
             clocks_s=dict.fromkeys(seconds) if self.settings.loop.lockstep else seconds,
-            notes=[*self._notes(tick, plant, controller, acted), *_saturated(values)],
+            notes=[*self._notes(tick, plant, controller, acted), *_saturated(values), *self._without_law()],
             events=[mark for mark in self.marks if abs((mark.time_s or 0) - tick * period) <= NEAR_S],
         )  # fmt: skip
 
@@ -203,6 +207,9 @@ class Instants:
             V = z.z1[0] @ z.z1[0] + z.z2[0] @ (J * z.z2[0]) / 2 + error @ (error / Gamma[0]) / 2  # (C.24)
             found["V"] = [float(V)]
         return found
+
+    def _without_law(self) -> list[str]:
+        return [] if self.law_unknown is None else [f"without its law: {self.law_unknown}"]
 
     def _notes(self, tick: int, plant: Any, controller: Any, acted: Any) -> list[str]:
         """What was late, missing or refused of a tick."""

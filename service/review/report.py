@@ -125,6 +125,11 @@ class Findings(Figures):
         default=[],
         description="ticks that no figure counts: the log does not hold the gains, the reference and the law's state",
     )
+    law_unknown: str | None = Field(
+        default=None,
+        description="why the law's own columns are missing (its state, gains, voltages before quantization); null if "
+        "they are not",
+    )
     unseen: dict[str, list[str]] = Field(
         default_factory=dict, description="what of the session no figure sees, by the figure whose limit permits it"
     )

@@ -18,7 +18,7 @@ from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.figures import Figures, figures
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
 from aeroloop.service.logs.session import Missing, Session, Truths, Unknown
-from aeroloop.service.logs.ticks import Ticks, recompute
+from aeroloop.service.logs.ticks import Ticks, recompute, with_known_law
 from aeroloop.service.review import events
 from aeroloop.service.review.panels import MAX_POINTS, panels_of
 from aeroloop.service.review.report import Disagreement, Findings, Recorded, Report, differences, flat
@@ -83,6 +83,7 @@ def read(
         its = recording.session(which, since_s, until_s)
     except ConfigError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
+    its, law_unknown = with_known_law(its)
     settings, loop, last = its.settings, its.settings.loop, max(its.extent.last.values())
     part, span = None, (0, last)
     unseen: list[Missing | Unknown] = [*(gap for gap in its.missing if gap.rows), *its.unknown]
@@ -140,7 +141,8 @@ def read(
         timing=spreads, clock_offset_us=[round(ns * 1e-3, 1) for ns in offset] if offset else None,
         gaps=longest, gap_count=gap_count, saturated=saturated, invalid=invalid, losses=losses, lapses=went,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS}, missing=missing,
-        unknown=its.unknown, unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
+        unknown=its.unknown, law_unknown=law_unknown,
+        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
     )  # fmt: skip
     path = paths[0].resolve()
     name = path.name if path.is_dir() else path.stem

@@ -209,6 +209,8 @@ def export_sheets(exported: Exported) -> Sheets:
     else:
         found = f"{exported.rows} ticks of {', '.join(exported.sessions)}"
     lines = [f"not read, {line}" for line in exported.damages] + [str(one) for one in exported.unknown]
+    if exported.law_unknown is not None:
+        lines.append(f"without its law: {exported.law_unknown}")
     if around := exported.around:
         lines.append(f"around: {around[0]}" + (f" ({len(around) - 1} more such events)" if len(around) > 1 else ""))
     if others := exported.left_out:

@@ -10,15 +10,21 @@ from datetime import UTC, datetime, timedelta
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.protocol.transport.certificate import SOON_DAYS
-from aeroloop.service.host.health import NEEDED, SILENT_S, Trouble
+from aeroloop.service.host.health import NEEDED, SILENT_S, Trouble, lacking_recorder
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.show import Row, Sheets
 
 
 def role_sheets(statuses: Mapping[str, Status], vehicle: str) -> Sheets:
-    """The roles of one vehicle, each with its last status."""
-    yield vehicle, [_row(role, statuses.get(role)) for role in sorted({*statuses, *NEEDED})]
-    if notes := [{"role": role, "note": note} for role, each in sorted(statuses.items()) for note in _notes(each)]:
+    """The roles of one vehicle, each with its last status; a recorder that is missed is missing, too."""
+    roles = {*statuses, *NEEDED}
+    notes = [{"role": role, "note": note} for role, status in sorted(statuses.items()) for note in _notes(status)]
+    lacking = lacking_recorder(statuses)
+    if lacking is not None:
+        roles.add("recorder")
+        notes.append({"role": "recorder", "note": f"{vehicle}{lacking}"})
+    yield vehicle, [_row(role, statuses.get(role)) for role in sorted(roles)]
+    if notes:
         yield "", notes
 
 
@@ -27,7 +33,7 @@ def status_sheets(found: Gathered) -> Sheets:
     recorded = sorted(vehicle for vehicle, statuses in found.statuses.items() if "recorder" in statuses)
     for vehicle, statuses in sorted(found.statuses.items()):
         yield from role_sheets(statuses, vehicle)
-        if recorded and vehicle not in recorded:
+        if recorded and vehicle not in recorded and lacking_recorder(statuses) is None:
             yield f"the recorder under {', '.join(recorded)} records every vehicle of its network", []
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages.operator import Hold
+from aeroloop.service.lab.fork import fork
 from aeroloop.service.testing.hil import Hil, HilError
 
 pytest_plugins = ["pytester"]
@@ -89,3 +90,16 @@ def test_verbs_in_lockstep_hold_from_the_next_tick_and_repeat_bit_for_bit(tmp_pa
     assert Hold.model_validate(changes[2]["reference"]).attitude == (0.0, -10.0, 20.0)
     assert figures[0] == 2.0
     assert operated(tmp_path / "b") == (changes, figures)
+
+
+@pytest.mark.parametrize("fault", ["delay=0.02@0.1..0.5", "reorder=0.3"])
+def test_in_lockstep_measurements_that_a_fault_holds_back_are_all_taken_in_order(tmp_path: Path, fault: str) -> None:
+    """So the run repeats: a fork from an instant with frames in flight gives the same frames."""
+    with Hil(tmp_path, lockstep=True) as hil:
+        hil.start(settings={"plant.faults": [f"measurement:{fault}"]})
+        hil.run(0.8)
+        log = hil.log
+    assert log.trips == []
+    again = fork([log.path], 100)
+    assert (again.parts, again.differed, again.ended) == (None, None, None)
+    assert again.compared > 250

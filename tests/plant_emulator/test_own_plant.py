@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from math import sin
 from typing import Any
 
@@ -15,6 +16,7 @@ from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
 from tests.support.own_plants import Turntable, TurntableSettings
@@ -169,7 +171,6 @@ def test_a_plant_that_does_not_fit_is_refused_and_closed(kind: str, faults: list
     ("plant", "why"),
     [
         ({"kind": f"{HERE}:Hardware"}, "Hardware (plant.kind) does not state that it is `repeatable`"),
-        ({"kind": f"{HERE}:Gone"}, "has no Gone"),
         ({"via": "quanser"}, "plant.via is 'quanser'"),
     ],
 )
@@ -178,6 +179,13 @@ def test_a_machine_is_not_moved_by_a_replay(plant: dict[str, Any], why: str) -> 
     assert why in (why_not(settings) or "")
     with pytest.raises(ValueError, match=r"plant\."):
         PlantReplay(LoopSettings(), WireSpec(), settings)
+
+
+def test_a_plant_whose_class_is_gone_is_refused_as_one_that_could_be_replayed() -> None:
+    settings = PlantSettings(kind=f"{HERE}:Gone")
+    for refused in (why_not, partial(PlantReplay, LoopSettings(), WireSpec())):
+        with pytest.raises(PluginError, match="has no Gone"):
+            refused(settings)
 
 
 def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:

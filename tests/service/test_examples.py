@@ -22,7 +22,7 @@ from aeroloop.service import examples
 from aeroloop.service.testing.hil import Hil, HilError
 from tests.support.failing_laws import FAILING
 from tests.support.made_log import make_log
-from tests.support.processes import LONGEST_S
+from tests.support.processes import LONGEST_S, PATIENT
 from tests.support.processes import aeroloop as aeroloop_command
 
 EXAMPLES = Path(examples.__path__[0])
@@ -94,12 +94,13 @@ def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(tmp_pat
         (tmp_path / name).write_text(command("show", "examples", name), encoding="utf-8")
     both = "--config", "own-plant.toml", "--set", "law.kind=own_law:OwnPythonLaw"
     command("demo", "--lockstep", "--duration", "2", "--log", "run.mcap", *both)
-    replayed = json.loads(command("log", "replay", "run.mcap", "--json"))
+    replayed = json.loads(command("log", "replay", "run.mcap", "--json", "--trust-law"))
     assert replayed["controller"] == {"ticks": 1000, "differ": 0}
     assert replayed["plant"]["differ"] == 0
-    review = command("log", "review", "run.mcap")
+    review = command("log", "review", "run.mcap", "--trust-law")
     assert "–  No theorem for this law, own_law:OwnPythonLaw." in review
-    command("log", "export", "run.mcap", "--format", "csv", "--out", "run.csv")
+    assert "without its law" not in review
+    command("log", "export", "run.mcap", "--out", "run.csv", "--trust-law")
     with (tmp_path / "run.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1000
@@ -113,6 +114,15 @@ def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(tmp_pat
 
 
 @pytest.mark.processes
+@pytest.mark.realtime
+def test_a_demo_whose_law_raises_says_so_and_does_not_blame_the_machine() -> None:
+    failing = ["--set", f"law.kind={FAILING}:Failing", "--set", "law.at=50"]
+    said = aeroloop_command("demo", "--duration", "5", *failing, code=1)
+    assert "RuntimeError: the estimator diverged" in said
+    assert "too busy" not in said
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("failure", "fault"),
     [
@@ -122,7 +132,9 @@ def test_laws_track_and_law_and_plant_run_as_processes_whose_log_replays(tmp_pat
 )
 def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, failure: str, fault: str) -> None:
     kind, fault = f"{FAILING}:Failing", f"law {FAILING}:Failing{fault}"
-    hil.start(settings={"law.kind": kind, "law.failure": failure, "plant.truth_rate_hz": 500}, drive=False)
+    failing = {"law.kind": kind, "law.failure": failure, "law.at": 50, "plant.truth_rate_hz": 500}
+    # A machine that stalls must not end the session before its law fails, and 50 ticks have a true state with voltages.
+    hil.start(settings={**PATIENT, **failing}, drive=False)
     hil.processes.start("controller")
     hil.eventually("the fault is an event", lambda: hil.happened("fault", fault))
     # It trips by the command without a value, or is released before it has read that, and then waits for a claim.

@@ -14,10 +14,10 @@ from aeroloop.service.lab.engine import Workers
 
 
 class InThisProcess(Executor):
-    def submit(self, work: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
         try:
-            future.set_result(work(*arguments))
+            future.set_result(work(*arguments, **named))
         except Exception as error:
             future.set_exception(error)
         return future

@@ -26,6 +26,7 @@ from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.session import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick
+from aeroloop.service.lab.lockstep import LockstepLoop
 from aeroloop.service.recording.rolling import LogFile
 from tests.support.clock import FakeClock
 from tests.support.plant_end import claim_of
@@ -216,6 +217,36 @@ def make_log(
     write(path, settings, messages, chunk_every)
 
 
+def make_log_with_faults_of_frames(path: Path, ticks: int, settings: Settings) -> None:
+    """Write a log of a lockstep loop whose plant holds back, drops, repeats or overtakes frames, as configured."""
+    loop, wire, messages = settings.loop, settings.wire, Messages()
+    plant_clock, clock = Clock("plant"), Clock("controller")
+    endpoint = settings.plant.endpoint(settings.plant.make(loop.period), loop, wire)
+
+    def publish(batch: bytes) -> None:
+        messages.add("trace", batch, plant_clock, "plant")
+
+    trace = PlantTrace(wire, publish, RUNS["plant"], plant_clock)
+    claim = claim_of("c", wire=wire, period_ns=loop.period_ns, lockstep=True, session=SESSION)
+    assert isinstance(endpoint.claim(claim), Grant)
+    trace.follow(endpoint)
+    end = ControllerEnd(settings, messages, clock)
+    both = LockstepLoop(endpoint, end.controller, endpoint.tick(None, 0))
+    arrival: Arrival | None = None
+    for k in range(ticks):
+        plant_clock.now_ns = clock.now_ns = k * loop.period_ns
+        trace.row(endpoint, both.measurement, arrival, plant_clock.monotonic_ns())
+        command: bytes | None = None
+        for answered in both.answer():
+            command, at_ns = answered.command, clock.monotonic_ns()
+            end.record(PlantTick(answered.k, answered.measurement, answered.received_as, at_ns, at_ns), command, at_ns)
+        arrival = both.advance(command)
+    end.publish(final=True)
+    endpoint.release(SESSION)
+    trace.follow(endpoint)
+    write(path, settings, messages.all)
+
+
 def made(
     settings: Settings,
     ticks: int,
@@ -270,6 +301,7 @@ def made(
         if k in injected:
             fault = injected[k]
             endpoint.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
+            trace.follow(endpoint)
         elif rough and rough.happens(0.004):
             endpoint.inject([Fault.parse(rough.chance.choice(ROUGH_FAULTS))])
             trace.follow(endpoint)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import nan
 from typing import TYPE_CHECKING, Annotated, Any, Final, Union
 
 import casadi as ca
@@ -57,8 +58,33 @@ class LawError(AeroloopError):
     """A law that cannot be used; one line with its name."""
 
 
+class UnknownLawSettings(CustomLawSettings):
+    """Settings of a log's law that cannot be had here: `UnknownLaw` stands for it."""
+
+
+class UnknownLaw(PythonLaw[UnknownLawSettings]):
+    """Stands for a law that cannot be had: no gains, no state and no voltages are known of it."""
+
+    Settings = UnknownLawSettings
+
+    def reset(self) -> None:
+        """Its state is not known."""
+        self.state = {}
+
+    def step(self, now: Now[Any]) -> list[float]:  # noqa: ARG002  # the law's argument
+        """Its voltages are not known."""
+        return [nan] * self.actuators
+
+
+def no_such_gain(kind: str, name: str, numbers: int) -> LawError:
+    """The error of a gain that a law of this kind does not have."""
+    return LawError(f"law {kind} has no gain {name} of {numbers} number{'' if numbers == 1 else 's'}")
+
+
 def law_class(section: LawSettings) -> type[Law[Any]]:
     """The class of the law that a section configures. Raises PluginError."""
+    if isinstance(section, UnknownLawSettings):
+        return UnknownLaw
     return find("law.kind", section.kind, BUILT_IN, Law)
 
 
@@ -101,9 +127,19 @@ def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
         raise LawError(f"law {section.kind} has no gain {unknown[0]}; it has {known}")
     changed: dict[str, Any] = dict(gains.named)
     for name, gain in gains.named.items():
-        if len(gain) == 1 and isinstance(getattr(settings, name), int | float):
+        present = getattr(settings, name)
+        size = len(present) if isinstance(present, Sequence) else 1
+        if len(gain) != size:
+            numbers = "number" if size == 1 else "numbers"
+            raise LawError(f"law.{name} is {size} {numbers}, such as {_as_typed(present)}, not {_as_typed(gain)}")
+        if not isinstance(present, Sequence):
             changed[name] = gain[0]
     return _valid(type(settings), settings.model_dump() | changed)
+
+
+def _as_typed(gain: float | Sequence[float]) -> str:
+    values = gain if isinstance(gain, Sequence) else [gain]
+    return " ".join(f"{value:g}" for value in values)
 
 
 def _valid(model: type[LawSettings], values: dict[str, Any]) -> LawSettings:

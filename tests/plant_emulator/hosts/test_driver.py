@@ -15,6 +15,7 @@ from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
 from aeroloop.plant_emulator.hosts.driver import IDLE_WAIT_S
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
+from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.plant_end import Stage
@@ -184,6 +185,26 @@ def test_faults_that_are_to_come_change_no_byte_and_leave_every_frame_as_it_arri
         assert (run.column("voltages") == without.column("voltages")).all()
         assert {status.changed for status in run.endpoint.fault_statuses()} == {0}
         assert run.events == []
+
+
+@pytest.mark.parametrize("fault", ["reorder=0.5", "duplicate=0.5", "drop=0.5", "delay=0.02"])
+def test_in_lockstep_an_overtaken_or_repeated_measurement_is_not_answered_and_not_waited_for(fault: str) -> None:
+    """The other end answers as a controller does: what is newer than all before it."""
+    answered = TickCounter(LOOP.period_ns, WIRE.measurement.counters, lockstep=True)
+
+    def as_a_controller(frame: bytes) -> None:
+        counter = WIRE.measurement.counter(frame)
+        assert counter is not None
+        if answered.advance(counter, 0) is not None:
+            run.command(frame, (1, -1))
+
+    run = Run(f"measurement:{fault}", lockstep=True)
+    run.wires.answer = as_a_controller
+    run.run(600)
+    assert run.endpoint.session is not None, run.endpoint.notices
+    assert run.column("session_tick").tolist() == list(range(600 + 1))
+    assert answered.tick >= 590  # and no tick was taken for one of a later round of the counter
+    assert answered.tick <= 600
 
 
 def test_configured_faults_count_from_the_claim_and_publish_begin_and_end_with_the_sessions_tick() -> None:

@@ -45,6 +45,12 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         ("op inject", "name a fault, such as rate:off@1..2, or give --clear"),
         ("op inject motors:bias=1e308", "bias takes -48 to 48 V, not 1e+308"),
         ("log export a.mcap --format foo", "'foo' is not one of 'parquet', "),
+        ("log export a.mcap --out a.xlsx", "--format, or --out FILE.parquet, FILE.csv or FILE.mcap"),
+        ("log export a.mcap", "--format, or --out FILE.parquet, FILE.csv or FILE.mcap"),
+        ("log step a.mcap --when 3", "No such option: --when (see `aeroloop log step --help`)"),
+        ("lab sweep --duraton 3", "No such option: --duraton: did you mean --duration? (see"),
+        ("op track sinusiod", "sinusiod is neither a reference nor a file: did you mean sinusoid?"),
+        ("op track points.csv", "cannot read points.csv"),
         ("log review a.mcap --from 3 --to 2", "--from 3 is not before --to 2"),
         ("log step a.mcap --at noon", "--at is a time such as 12.34, or a tick such as tick:6170, not noon"),
         ("log step a.mcap --at tick", "a tick such as tick:6170, not tick"),
@@ -78,6 +84,12 @@ def test_what_cannot_be_done_exits_with_1_and_is_named(capfd: pytest.CaptureFixt
         ):
             code, line = refusal(capfd, *words)
             assert (code, named in line) == (1, True)
+
+
+def test_a_run_that_does_not_fit_into_memory_is_refused_before_it_begins(capfd: pytest.CaptureFixture[str]) -> None:
+    code, line = refusal(capfd, "lab", "experiment", "--duration", "1e9")
+    assert code == 1
+    assert "a run of 1e+09 s at 500 Hz does not fit into this machine's memory: " in line
 
 
 def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixture[str]) -> None:

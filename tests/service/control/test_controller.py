@@ -15,6 +15,7 @@ import pytest
 
 from aeroloop.plant_emulator.model.emulated import SUBSTEPS
 from aeroloop.protocol.messages.operator import Hold, Reference, Sinusoid
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service import examples
 from aeroloop.service.config import Settings, as_overrides, bits_overrides, load, load_over
 from aeroloop.service.control.controller import Controller
@@ -197,3 +198,13 @@ def test_a_start_with_negative_eta_of_the_error_goes_the_short_way_and_stays_the
     assert error.max() <= sin(AWAY / 2) + ERRORS[bits]
     # The slowest pole, near −2.4 1/s, has made less than 1e-5 of the start after 5 s.
     assert error[run.settings.loop.ticks(5.0) :].max() < ERRORS[bits]
+
+
+def test_an_empty_frame_is_silence_only_where_measurements_are_sent_on_change() -> None:
+    """Elsewhere it is malformed: the levels of an older measurement are not taken for those of this tick."""
+    for transmit, answered, refused in (("periodic", False, 1), ("on_change", True, 0)):
+        settings = load(overrides=[f'wire.transmit="{transmit}"'])
+        controller = Controller(settings.wire, LAW, Hold(), settings.loop.period)
+        assert controller.tick(settings.wire.measurement.pack(0, [0] * 6), 0)
+        assert (controller.tick(UNCHANGED, 1) is not None) == answered
+        assert (controller.refused, controller.tick_index) == (refused, int(answered))

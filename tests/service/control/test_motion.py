@@ -373,6 +373,18 @@ def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
     assert max(turning) <= BODY.rate * SAMPLED
 
 
+@settings(max_examples=100)
+@given(start=any_states())
+@example(of_axis(1, 0.0, 1.0, 0.9))  # the acceleration that it begins with counts
+@example(of_axis(1, 0.0, 0.5, -1.0))
+def test_braking_stays_within_1_rad_per_s2_or_what_it_begins_with_where_no_limit_is_near(start: Angles) -> None:
+    brake_s = braking_times(start, NO_LIMITS)
+    assert np.all(brake_s[np.abs(start.rate[0]) + np.abs(start.acceleration[0]) == 0] == 0)
+    braking = braked(start, brake_s, np.linspace(0.0, float(brake_s.max()), 500))
+    largest = np.maximum(1.0, np.abs(start.acceleration[0]))
+    assert np.all(np.abs(braking.acceleration).max(axis=0) <= largest * (1 + ROUNDING))
+
+
 @pytest.mark.parametrize(
     ("pitch", "rate", "acceleration"),
     [
@@ -475,6 +487,34 @@ def test_a_quintic_to_a_set_point_that_would_tilt_beyond_the_limit_is_not_taken(
     approach = to_set_point(target, start, 1.0, BENCH)
     tilts = way(approached(target, start, 0.0, approach), target, approach.within_s).tilts()
     assert tilts.max() <= BENCH.tilt * SAMPLED
+
+
+def tilts_to(start: Angles, target: Hold, asked_s: float) -> Array:
+    trajectory = Trajectory.of(target)
+    approach = to_set_point(trajectory, start, asked_s, BODY)
+    return np.asarray(way(approached(trajectory, start, 0.0, approach), trajectory, approach.within_s).tilts())
+
+
+def test_a_quintic_that_would_tilt_too_far_is_not_taken_to_a_set_point() -> None:
+    """At 50° and 0.95 rad/s, asked to be at 50° a second later: a quintic would go to 60.6°."""
+    start, target = of_axis(1, radians(50), 0.95, 0.0), Hold(attitude=(0.0, 50.0, 0.0))
+    trajectory = Trajectory.of(target)
+    quintic = approached(trajectory, start, 0.0, Approach(1.0)).samples()
+    assert quintic.tilts().max() > BODY.tilt
+    assert quintic.speeds().max() <= BODY.rate
+    assert tilts_to(start, target, 1.0).max() <= BODY.tilt
+
+
+@settings(max_examples=50)
+@given(start=any_states(), target=turns.map(lambda a: Hold(attitude=a)), asked_s=seconds(0.02, 2.0))
+def test_on_the_way_to_a_set_point_the_tilt_keeps_its_limit(start: Angles, target: Hold, asked_s: float) -> None:
+    assume(start.speeds().max() <= BODY.rate)
+    braking = braked(start, braking_times(start, BODY), np.linspace(0.0, 5.0, 500)).tilts().max()
+    try:
+        tilts = tilts_to(start, target, asked_s)
+    except FollowError:
+        return  # no way is within the limits
+    assert tilts.max() <= max(BODY.tilt, braking) * SAMPLED
 
 
 ROLLS = Sinusoid(amplitude=(1.0, 0.0, 0.0), frequency=(0.3, 0.0, 0.0))

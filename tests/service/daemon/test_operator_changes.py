@@ -91,6 +91,7 @@ def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     ("topic", "payload", "why"),
     [
         ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "law.C1[2]: should be less than or equal to 20"),
+        ("set_gains", b'{"C2": [0.2]}', "law.C2 is 3 numbers, such as 0.15 0.15 0.15, not 0.2"),
         ("set_gains", b'{"C9": [1, 1, 1]}', "no gain C9; it has C1, C2, Gamma"),
         ("set_gains", b"gains, please", "Gains"),
         ("track", Track(reference=Hold(attitude=(0.0, 61.0, 0.0))), "max_reference_tilt_deg"),

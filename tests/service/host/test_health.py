@@ -14,6 +14,7 @@ from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host.health import LATE_SHARE, SILENT_S, Trouble, troubles
 from aeroloop.service.host.operator import Gathered, gather
+from aeroloop.service.terminal.roles import role_sheets, status_sheets
 from tests.support.clock import FakeClock
 from tests.support.zenoh_network import Gathering, eventually
 
@@ -58,6 +59,22 @@ def test_each_trouble_is_named_with_its_role(changed: Status, kind: str, says: s
     assert trouble.kind == kind
     assert trouble.role == ("recorder" if changed.lacks_recorder else changed.role)
     assert says in trouble.text
+
+
+@pytest.mark.parametrize(("lacks", "says"), [("gone", "recorder is gone"), ("required", "requires one"), (None, "")])
+def test_a_recorder_that_is_missed_stands_among_the_roles_as_missing(lacks: str | None, says: str) -> None:
+    roles = {
+        "controller": status("controller", "running", lacks_recorder=lacks),
+        "plant": status("plant", "driven", lacks_recorder=lacks),
+    }
+    (_, rows), *notes = role_sheets(roles, "aero")
+    shown = {row["role"]: row["state"] for row in rows}
+    assert shown.get("recorder") == ("missing" if lacks else None)
+    told = [row["note"] for _, lines in notes for row in lines if row["role"] == "recorder"]
+    assert [says in note for note in told] == [True] * (lacks is not None)
+    other = {"beta": {"recorder": status("recorder", "recording")}}
+    titles = [title for title, _ in status_sheets(Gathered({"aero": roles} | other, []))]
+    assert ("the recorder under beta records every vehicle of its network" in titles) == (lacks is None)
 
 
 def test_what_is_missing_or_does_not_answer_is_named_and_what_is_within_the_limits_is_well() -> None:

@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import aeroloop
 from aeroloop.protocol.errors import AeroloopError, ConfigError
+from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load, load_over
 from aeroloop.service.lab.check import check_log, check_logs, logs_of
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.lab.fork import REPLAYED, fork
+from aeroloop.service.lab.fork import REPLAYED, ForkError, fork
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.session import Session
@@ -22,11 +24,23 @@ from aeroloop.service.logs.ticks import euler_deg
 from aeroloop.service.review.review import read
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws, own_plants
+from tests.support.edited_log import Said, contents, rewrite
 from tests.support.in_this_process import run_here
-from tests.support.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+from tests.support.made_log import (
+    AN_OPERATORS_WORDS,
+    lockstep,
+    made,
+    make_log,
+    make_log_with_faults_of_frames,
+    write,
+)
 
 TICKS = 450
+LONGER = 1700
+LOST = 24  # of the batches of 51 ticks: one that is between two records of what is in force
+NO_RECORD = 31  # so many first batches have all records
 PLANT = ["session_tick", "sent_as", "received_as", "outcome", "answered", "measurement", "command"]
+TAIL_BYTES = slice(12, 16)  # where a batch's header has the length of its tail
 CONTROLLER = ["tick", "received_as", "sent_as", "measurement", "command"]
 
 
@@ -54,9 +68,142 @@ def test_a_fork_with_no_change_repeats_the_rest_of_a_lockstep_log(tmp_path: Path
     assert_repeats(log, out, tick)
     assert found.figures.z_track == found.recorded.figures.z_track
     assert (found.figures.log, found.forked.findings.log) == (str(out), str(out))
-    again = replay([out], ends=["controller"])
+    again = replay([out])
     assert (again.differs, again.complete) == (False, True)
+    assert again.reasons == {
+        "plant": f"a fork's plant begins in flight, at tick {tick}: only the log that was forked has its state"
+    }
     assert not read(out).findings.missing
+
+
+def test_a_fork_is_read_from_the_middle_with_the_state_that_its_law_had_there(tmp_path: Path) -> None:
+    log, out, damaged = GOLDEN / "default.mcap", tmp_path / "fork.mcap", tmp_path / "damaged.mcap"
+    whole = fork([log], 1000, duration_s=4, log=out).ticks
+    part = read(out, since_s=4).ticks
+    assert part.k[0] == 2000
+    last = whole.where(whole.k >= 2000)
+    assert np.array_equal(part.state, last.state)
+    assert np.array_equal(part.unquantized, last.unquantized)
+    assert np.abs(last.state[0, :3] - whole.state[0, :3]).max() > 1e-5  # the estimate has changed
+
+    batches = [one for one in contents(out)[0] if one.topic == "trace" and one.key.endswith("controller")]
+    lost = batches[10]
+    rewrite(out, damaged, lambda one: None if one == lost else one)
+    again = replay([damaged], ends=["controller"])
+    assert (again.differs, again.unknown) == (False, [])
+
+
+def without_states(one: Said) -> Said:
+    """A controller's batch without the law's state, but for the session's first."""
+    batch = read_batch(one.data) if one.topic == "trace" else None
+    if batch is None or batch.header.end != "controller" or not batch.header.first_row:
+        return one
+    begin = len(one.data) - batch.header.tail_bytes
+    tail = batch.tail.model_copy(update={"state": None}).model_dump_json(exclude_none=True).encode()
+    header = bytearray(one.data[:begin])
+    header[TAIL_BYTES] = len(tail).to_bytes(4, "little")
+    return one._replace(data=bytes(header) + tail)
+
+
+def test_a_state_that_a_log_lacks_is_computed_from_the_last_one_or_unknown_and_never_the_initial_one(
+    tmp_path: Path,
+) -> None:
+    """As the first forks' logs: they have the law's state in their first batch only."""
+    make_log(log := tmp_path / "run.mcap", LONGER)
+    old = rewrite(log, tmp_path / "old.mcap", without_states)
+    part, expected = read(old, since_s=0.5).ticks, read(log, since_s=0.5).ticks
+    assert np.array_equal(part.state, expected.state)
+    assert np.array_equal(part.unquantized, expected.unquantized)
+
+    batches = [one for one in contents(old)[0] if one.topic == "trace" and one.key.endswith("controller")]
+    damaged = rewrite(old, tmp_path / "damaged.mcap", lambda one: None if one == batches[LOST] else one)
+    again = replay([damaged], ends=["controller"])
+    lost = read_batch(batches[LOST].data)
+    assert lost is not None
+    assert not again.differs
+    (unknown,) = again.unknown
+    assert unknown.first_tick == lost.columns["tick"][-1] + 1
+    assert unknown.last_tick == LONGER - 1
+    assert not again.complete
+    assert read(damaged).ticks.k[-1] < unknown.first_tick
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        ["measurement:delay=0.02@0.1..0.7"],
+        ["measurement:delay=0.6@0.1..0.85"],  # longer than the counter's range
+        ["measurement:reorder=0.3", "measurement:duplicate=0.3"],
+        ["command:delay=0.02", "measurement:drop=0.2"],
+    ],
+)
+@pytest.mark.parametrize("transmit", ["periodic", "on_change"])
+def test_a_fork_goes_on_with_the_frames_that_are_in_flight(tmp_path: Path, faults: list[str], transmit: str) -> None:
+    log, out = tmp_path / "run.mcap", tmp_path / "fork.mcap"
+    patient = ["plant.watchdog_s=2", "controller.stale_s=2", f'wire.transmit="{transmit}"']
+    make_log_with_faults_of_frames(log, TICKS, lockstep(*patient, f"plant.faults={json.dumps(faults)}"))
+    recorded = session(log)
+    rows = recorded.controller
+    for tick in (52, 60, 200, 352, 440):
+        out.unlink(missing_ok=True)
+        found = fork([log], tick, log=out)
+        assert (found.parts, found.differed, found.ended) == (None, None, None)
+        assert found.compared > 0
+        forked = session(out)
+        plant = recorded.plant[recorded.plant["session_tick"] >= tick]
+        assert plant[PLANT].tolist()[: len(forked.plant)] == forked.plant[PLANT].tolist()
+        again = forked.controller
+        assert rows[rows["tick"] >= again["tick"][0]][CONTROLLER].tolist()[: len(again)] == again[CONTROLLER].tolist()
+        assert (replay([out]).differs, replay([out]).complete) == (False, True)
+
+
+def test_a_fork_and_the_recorded_run_are_judged_over_the_same_span(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", TICKS)
+    dead = fork([log], 200, faults=["rate:off"])
+    assert dead.ended is not None
+    assert dead.figures.duration_s == 0.002  # without a rate no measurement is valid
+    assert dead.recorded.figures.duration_s == dead.figures.duration_s
+    assert dead.recorded.ticks.k.tolist() == dead.ticks.k.tolist()
+
+
+def test_a_session_that_is_read_is_the_one_that_is_forked(tmp_path: Path) -> None:
+    settings = lockstep()
+    second = [
+        message._replace(key=message.key.replace("s1", "s2"))
+        for message in made(settings, 100, session="s2", at_ns=60_000_000_000)
+    ]
+    log = write(tmp_path / "two.mcap", settings, [*made(settings, 300), *second])
+    run = aeroloop.read_run(log, session="s2")
+    assert (run.session, run.ticks.k[-1]) == ("s2", 99)
+    assert run.fork(50).recorded.findings.session == "s2"
+
+
+def test_what_an_operator_did_just_after_the_forks_tick_acts(tmp_path: Path) -> None:
+    make_log(faulty := tmp_path / "faulty.mcap", TICKS, injected={201: "rate.y:bias=0.5"})
+    out = tmp_path / "fork.mcap"
+    assert fork([faulty], 200, log=out).parts is None  # it was injected after tick 200
+    assert_repeats(faulty, out, 200)
+    assert fork([faulty], 201).parts is None  # and not twice
+
+
+def test_a_fork_resumes_after_a_gap_and_refuses_a_tick_whose_state_the_log_lacks(tmp_path: Path) -> None:
+    make_log(log := tmp_path / "run.mcap", LONGER)
+    batches = [one for one in contents(log)[0] if one.topic == "trace" and one.key.endswith("controller")]
+    lost = read_batch(batches[LOST].data)
+    assert lost is not None
+    first, last = int(lost.columns["tick"][0]), int(lost.columns["tick"][-1])
+    damaged = rewrite(log, tmp_path / "damaged.mcap", lambda one: None if one == batches[LOST] else one)
+    resumed, recorded = fork([damaged], last + 1), read(log).ticks
+    assert resumed.parts is None
+    assert np.array_equal(resumed.ticks.state[0], recorded.state[recorded.k == last + 1][0])
+    for tick in (first + 1, last):
+        with pytest.raises(ForkError, match=f"tick {tick} cannot be forked: "):
+            fork([damaged], tick)
+
+    first_ones = batches[:NO_RECORD]
+    nothing_known = rewrite(log, tmp_path / "unknown.mcap", lambda one: None if one in first_ones else one)
+    with pytest.raises(ForkError, match="cannot be forked"):
+        fork([nothing_known], 0)
 
 
 @pytest.mark.parametrize(

@@ -54,8 +54,10 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     run_here(monkeypatch)
     words = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
     words += ["--duration", "3", "--seeds", "2", "--set", "loop.rate_hz=100"]
-    assert execute(["lab", "laws", *words, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    assert execute(["lab", "laws", *words, "--json"]) == 1
+    printed = capsys.readouterr()
+    assert "plain Python: " in printed.err
+    found = json.loads(printed.out)
     rows = {(row["law"], row["wind"]): row for row in found["rows"]}
     settings = compared(SLOW, "pd")["pd"]
     for wind, blowing in (("calm", "false"), ("wind", "true")):
@@ -74,7 +76,7 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     assert "the loop ended after" in runaway["reason"]
     assert "RuntimeError: the estimator diverged (failing_laws.py, line" in raising["reason"]
 
-    assert execute(["lab", "laws", *words, "--markdown"]) == 0
+    assert execute(["lab", "laws", *words, "--markdown"]) == 1
     text = capsys.readouterr().out
     assert f"{RUNAWAY}, calm: 2 of 2 seeds: the loop ended after" in text
     assert "| none | none |" in text

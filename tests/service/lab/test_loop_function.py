@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import tempfile
 from contextlib import suppress
@@ -146,6 +147,14 @@ def test_a_run_that_trips_ends_as_through_frames_with_its_reason(overrides: list
     with pytest.raises(LoopEndedError) as found:
         experiment(settings, 4.0)
     assert str(found.value) == str(known.value)
+
+
+def test_why_a_loop_ended_survives_the_way_from_a_worker_process() -> None:
+    ended = LoopEndedError(0.25, ["tilted by 91°: 0 V"])
+    again = pickle.loads(pickle.dumps(ended))  # noqa: S301  # it is what was pickled here
+    assert (type(again), str(again), again.after_s) == (LoopEndedError, str(ended), 0.25)
+    assert str(ended) == "the loop ended after 0.25 s: tilted by 91°: 0 V"
+    assert str(LoopEndedError(0.25, [])) == "the loop ended after 0.25 s: no answer"
 
 
 def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:

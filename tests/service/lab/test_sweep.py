@@ -169,6 +169,10 @@ def test_a_run_that_trips_is_a_row_with_its_reason(tmp_path: Path) -> None:
     assert "the loop ended after" in tripped["reason"]
     assert tripped["z_track"] is tripped["skipped_ticks"] is fine["reason"] is None
     assert fine["z_track"] > 0
+    options = ["--duration", str(S), "--seeds", "1", "--force"]
+    for vary, code in ((limits, 1), ("plant.limits.max_rate=9,10", 0)):
+        assert execute(["lab", "sweep", "--out", str(tmp_path / "b.csv"), "--vary", vary, *options]) == code
+    assert len((tmp_path / "b.csv").read_text().splitlines()) == 3
 
 
 def test_a_sweep_runs_what_is_new_in_values_seeds_or_code_and_ends_in_the_same_table(

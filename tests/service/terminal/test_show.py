@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from io import StringIO
+from pathlib import Path
 
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.transport.certificate import SOON_DAYS
 from aeroloop.service.config import load
+from aeroloop.service.review.report import Mark
+from aeroloop.service.review.review import read
 from aeroloop.service.terminal import show as module
+from aeroloop.service.terminal.log_sheets import review_sheets
+from aeroloop.service.terminal.roles import role_sheets
 from aeroloop.service.terminal.sheets import certificate_sheets
 from aeroloop.service.terminal.show import Row, markdown, show, show_all
 from aeroloop.service.theorem.certificate import certify
+from tests.support.made_log import make_log
 
 ROWS: list[Row] = [
     {"law": "adaptive", **{f"figure {i} of several": f"{i}.{i} (×1.0{i})" for i in range(8)}, "reason": ""},
@@ -53,6 +62,39 @@ def test_markdown_has_every_cell_and_numbers_but_no_sentences_to_the_right() -> 
     text = markdown([("laws", rows), ("a note", [])])
     table = ["| law | kbit/s | kind |", "|---|--:|---|", "| pd | 1.0 | 8 bits, uniform |", "| 2 | – | 2 samples |"]
     assert text.splitlines() == ["**laws**", "", *table, "", "a note"]
+
+
+def test_the_first_column_names_a_row_and_stands_to_the_left_even_if_its_names_are_numbers() -> None:
+    rows: list[Row] = [{"bits": "8", "z_track": "1.5"}, {"bits": "10", "z_track": "1.2"}]
+    assert markdown([("", rows)]).splitlines()[1] == "|---|--:|"
+
+
+def test_events_that_differ_in_numbers_only_are_one_with_count_and_time_of_the_last(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_log(log := tmp_path / "run.mcap", 100)
+    times = {0.02: 3, 0.05: 7, 0.11: 9}
+    faults = [Mark(time_s=at, kind="fault", role="controller", text=f"{n} ticks missed") for at, n in times.items()]
+    trips = [Mark(time_s=at, kind="tripped", role="plant", text="no fresh command for 100 ms") for at in (0.06, 0.12)]
+    found = read(log).findings.model_copy(update={"marks": sorted([*faults, *trips], key=lambda mark: mark.time_s)})
+    show_all(review_sheets(found))
+    shown = capsys.readouterr().out
+    assert "3 ticks missed (3 such events in all, the last: 0.110 s)" in shown
+    assert "7 ticks missed" not in shown
+    assert shown.count("no fresh command for 100 ms") == 2  # each trip by itself
+
+
+def test_a_certificate_that_expires_soon_is_a_note_and_one_that_lasts_is_none() -> None:
+    notes = []
+    for days in (SOON_DAYS - 1, SOON_DAYS + 1):
+        until = datetime.now(UTC) + timedelta(days=days)
+        status = Status(
+            role="plant", state="idle", uptime_s=1, ticks=1, rate_hz=500, skipped=0, certificate_until=until
+        )  # fmt: skip
+        _, *more = role_sheets({"plant": status}, "aero")
+        notes.append([row["note"] for _, rows in more for row in rows])
+    assert notes[1] == []
+    assert notes[0][0].startswith("its certificate expires at ")
 
 
 def test_a_certificate_shows_its_verdict_and_what_decides_and_on_request_every_term(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.trace import Sent
 from aeroloop.service.config import as_overrides, load
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil import Hil, HilError, HilLog
@@ -41,6 +42,14 @@ def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path)
         _ = lacking.z_track
     with pytest.raises(HilError, match="session"):
         HilLog(tmp_path / "a.mcap").figures_of(7)
+
+
+def test_times_are_those_of_frames_and_not_of_silence(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 200, settings=load(overrides=["loop.lockstep=true", 'wire.transmit="on_change"']))
+    log = HilLog(tmp_path / "a.mcap")
+    silent = sum(int((batch.columns["sent_as"] == Sent.SILENT).sum()) for batch in log.batches("controller"))
+    assert silent > 0
+    assert len(log.times("controller", "sent")) == 200 - silent
 
 
 def test_evidence_is_a_page_and_the_events_beside_the_log(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.laws.interface import gravity_torque, voltages_for
 from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, with_gains
 from aeroloop.service.lab.experiment import experiment
-from tests.support import failing_laws
+from tests.support import failing_laws, own_laws
 from tests.support.failing_laws import FAILING, Failure
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Expressions
 
@@ -230,3 +230,23 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     step = failing_laws.Failing.step.__code__.co_firstlineno
     assert WHY[failure].format(line=line, step=step) in one.fault
     assert len(one.fault.splitlines()) == 1
+
+
+def test_a_law_that_fails_keeps_the_state_that_it_had_in_a_session_that_is_continued_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ran, continued = controller(PYTHON, still=True), controller(PYTHON, still=True)
+    for k in range(5):
+        ran.tick(measurement(CONTINUOUS, k, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0), k)
+    assert any(ran.law_state["sum"])
+    continued.restore(ran.state)
+
+    def fails(law: Any, _: Any) -> None:
+        law.state["sum"] = law.state["sum"] + 1.0
+        raise RuntimeError("the estimator diverged")
+
+    monkeypatch.setattr(own_laws.Python, "step", fails)
+    continued.tick(measurement(CONTINUOUS, 5, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0), 5)
+    assert "the estimator diverged" in (continued.fault or "")
+    assert continued.law_state == ran.law_state
+    assert continued.tick_index == 5
