@@ -24,7 +24,6 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Header, PlantChange, PlantRow, Sent, Tail, TraceWriter
-from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.runtime.timing import Clock
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
@@ -134,22 +133,22 @@ def cut(batch: Batch, rows: int) -> Batch:
 
 
 def why_not(plant: PlantSettings) -> str | None:
-    """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class."""
+    """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class.
+
+    Raises PluginError if the class cannot be had here.
+    """
     if plant.via != "emulator":
         return f"plant.via is {plant.via!r}: only an emulated plant is computed again"
     if plant.emulated:
         return None
-    try:
-        found = class_of(plant.kind)
-    except PluginError as error:
-        return str(error)
+    found = class_of(plant.kind)
     return None if found.repeatable else f"{found.__name__} (plant.kind) does not state that it is `repeatable`"
 
 
 class PlantReplay:
     """Replays one process of an emulated plant: `endpoint` is as it was after the last row, `last` that row computed.
 
-    Raises ValueError with the reason of `why_not`, or PlantError.
+    Raises ValueError with the reason of `why_not`, PluginError as it does, or PlantError.
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
@@ -245,7 +244,8 @@ class PlantReplay:
         name, reason, cause = change.name or "", change.reason or "", change.cause or TripCause.OPERATOR
         match change.kind:
             case "claim":
-                assert change.claim is not None
+                if change.claim is None:
+                    raise AeroloopError(f"the claim after tick {change.tick} does not say what it claims")
                 if isinstance(answer := endpoint.claim(change.claim), Refusal):
                     raise AeroloopError(f"the claim after tick {change.tick} is refused: {answer.reason}")
             case "release":

@@ -15,6 +15,7 @@ from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
 from tests.support.own_plants import Turntable, TurntableSettings
@@ -169,7 +170,6 @@ def test_a_plant_that_does_not_fit_is_refused_and_closed(kind: str, faults: list
     ("plant", "why"),
     [
         ({"kind": f"{HERE}:Hardware"}, "Hardware (plant.kind) does not state that it is `repeatable`"),
-        ({"kind": f"{HERE}:Gone"}, "has no Gone"),
         ({"via": "quanser"}, "plant.via is 'quanser'"),
     ],
 )
@@ -178,6 +178,12 @@ def test_a_machine_is_not_moved_by_a_replay(plant: dict[str, Any], why: str) -> 
     assert why in (why_not(settings) or "")
     with pytest.raises(ValueError, match=r"plant\."):
         PlantReplay(LoopSettings(), WireSpec(), settings)
+
+
+def test_a_machine_whose_class_is_not_here_is_no_machine_that_cannot_be_replayed() -> None:
+    for replayed in (why_not, lambda plant: PlantReplay(LoopSettings(), WireSpec(), plant)):
+        with pytest.raises(PluginError, match="has no Gone"):
+            replayed(PlantSettings(kind=f"{HERE}:Gone"))
 
 
 def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:
