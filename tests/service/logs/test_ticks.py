@@ -18,7 +18,7 @@ from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
-from aeroloop.service.logs.ticks import Ticks, recompute
+from aeroloop.service.logs.ticks import Ticks, clock_offset, recompute
 from aeroloop.service.review.review import review
 from aeroloop.service.testing.hil_log import HilLog
 from tests.golden.make import HERE as GOLDEN
@@ -101,6 +101,13 @@ def test_ticks_without_a_valid_measurement_are_left_out_of_every_column(tmp_path
     assert {len(column) for column in found.ticks} == {480}
     assert not np.isnan(found.ticks.unquantized).any()
     check_by_telemetry(found.ticks, log, lockstep())
+
+
+def test_the_offset_of_two_clocks_is_that_of_the_frames_that_did_not_queue() -> None:
+    """Both ways take 150 µs and the clocks differ by 5 s; every third command waits in a queue for up to 20 ms."""
+    waits_ns = np.where(np.arange(1024) % 3 == 0, np.random.default_rng(1).uniform(1e6, 2e7, 1024), 0.0)
+    offset = clock_offset(np.full(1024, 5e9 + 150e3), 150e3 - 5e9 + waits_ns)
+    assert offset == pytest.approx(5e9, abs=1.0)
 
 
 def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(

@@ -77,6 +77,14 @@ def test_events_are_shown_once_at_their_sender_s_time_as_of_the_role_in_their_ke
     assert change.endswith("follows a sinusoid of roll, pitch, yaw 0°, 40°, 100° (by ann@lab, ann)")
 
 
+def test_what_happened_soon_after_the_session_has_no_time_in_it(whole: Path, tmp_path: Path) -> None:
+    """The tick after the last one is still the session's: what it ended with."""
+    said = [event(0.999, "recorder", "changed", "at the end", None), event(1.02, "recorder", "changed", "after", None)]
+    marks = found(rewrite(whole, tmp_path / "a.mcap", more=said)).marks
+    times = {mark.text: mark.time_s for mark in marks if mark.role == "recorder"}
+    assert times == {"at the end": pytest.approx(0.999, abs=1e-3), "after": None}
+
+
 @pytest.mark.parametrize(("tick", "at_s"), [(TICKS, 1.0), (TICKS + 1, 0.998)], ids=["the next", "a later"])
 def test_an_event_just_after_the_last_tick_keeps_its_tick(whole: Path, tmp_path: Path, tick: int, at_s: float) -> None:
     """A plant trips before it measures: its tick is the one after the last. A later one is nobody's tick."""
