@@ -230,7 +230,7 @@ class TraceIndex:
             after, kept = 0, list[Entry]()
             # one without rows precedes the batch that starts at the same row
             for entry in sorted(entries, key=lambda e: (e.header.first_row, e.header.rows > 0, e.header.monotonic_ns)):
-                if not entry.header.rows or entry.header.first_row >= after:
+                if entry.header.first_row >= after:
                     kept.append(entry)
                     after = max(after, entry.after)
                     rows[source.vehicle, source.end, entry.header.session][source] += entry.header.rows

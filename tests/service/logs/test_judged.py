@@ -81,6 +81,15 @@ def unclaimed(run: int) -> bytes:
     return writer.take(LATER_NS, START_NS + LATER_NS)
 
 
+def ended(run: int, first_row: int) -> bytes:
+    """A plant's batch without rows that ends the real session before a row."""
+    writer = TraceWriter("plant", lockstep().wire, run)
+    writer.session = SESSION
+    data = bytearray(writer.take(LATER_NS, START_NS + LATER_NS, final=True))
+    data[24:32] = first_row.to_bytes(8, "little")
+    return bytes(data)
+
+
 def trace(end: End, data: bytes, vehicle: str = VEHICLE) -> Said:
     return Said(topics.key("trace", vehicle, role=end), START_NS + LATER_NS, data)
 
@@ -99,6 +108,7 @@ STRANGERS: dict[str, list[Said]] = {
         trace("controller", batch_of("controller", RUNS["controller"], "mine", ROWS)),
         trace("plant", batch_of("plant", RUNS["plant"], "other", ROWS)),
     ],
+    "an end in the middle of the real run": [trace("plant", ended(RUNS["plant"], row)) for row in (7, 60, 599)],
     "a tick of the far future": [trace("controller", batch_of("controller", 77, "mine", 4_000_000_000))],
     "a description of an unknown end": [
         Said(topics.key("description", "ghost", role="controller"), START_NS, b'{"protocol": 2}'),
