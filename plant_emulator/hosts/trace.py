@@ -255,7 +255,8 @@ class PlantReplay:
         name, reason, cause = change.name or "", change.reason or "", change.cause or TripCause.OPERATOR
         match change.kind:
             case "claim":
-                assert change.claim is not None
+                if change.claim is None:
+                    raise AeroloopError(f"the claim after tick {change.tick} does not say what it claims")
                 if isinstance(answer := endpoint.claim(change.claim), Refusal):
                     raise AeroloopError(f"the claim after tick {change.tick} is refused: {answer.reason}")
             case "release":

@@ -247,6 +247,7 @@ class TraceWriter:
         self._run = run
         self._published = 0
         self._base_ns = 0
+        self._first_ns = 0  # of the first row that is buffered, on this end's monotonic clock
 
     @property
     def empty(self) -> bool:
@@ -256,14 +257,16 @@ class TraceWriter:
     def due(self, now_ns: int) -> bool:
         """Whether a batch is to be published: the buffer is full, or its first row is `TRACE_NS` old."""
         if self._rows:
-            return len(self._rows) >= MAX_ROWS or now_ns - self._base_ns >= TRACE_NS + _MARGIN_NS
+            return len(self._rows) >= MAX_ROWS or now_ns - self._first_ns >= TRACE_NS
         return not self.empty
 
     def row(self, row: ControllerRow | PlantRow) -> None:
         """Add a row of this end; at most MAX_ROWS until `take`."""
         if not self._rows:
             first_ns = row.received_ns if isinstance(row, ControllerRow) else row.sent_ns or row.received_ns
-            self._base_ns = first_ns - _MARGIN_NS
+            self._first_ns = first_ns
+            # A plant that was halted may act on a command that it received long before: no time is before the base.
+            self._base_ns = min(first_ns - _MARGIN_NS, row.received_ns or first_ns)
         self._rows.append(row)
 
     def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:

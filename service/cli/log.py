@@ -162,6 +162,7 @@ def replay(
         Literal["host", "aarch64", "cortex-m4"], typer.Option("--machine", help="With --end c: where it runs.")
     ] = "host",
     trust_law: TrustLaw = False,
+    vehicle: Vehicle = None,
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces, byte for byte. Exits with 1 unless all of it is the same."""
@@ -177,7 +178,8 @@ def replay(
     elif machine != "host":
         fail("--machine is for --end c", 2)
     with working("replaying", json, 1) as update, trusting(trust_law):
-        replayed = replay(logs, progress=update, ends=[end] if end else ENDS, answering=answering)
+        ends = [end] if end else ENDS
+        replayed = replay(logs, progress=update, ends=ends, answering=answering, vehicle=vehicle)
     show(replayed, json, replay_sheets)
     if replayed.differs or not replayed.complete:
         raise typer.Exit(1)

@@ -25,6 +25,7 @@ from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, parts
 from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, LawSettings, Now, PythonLaw
 from aeroloop.service.control.laws.registry import (
+    LawError,
     check_answer,
     configured_gains,
     initial_state,
@@ -277,8 +278,14 @@ class Controller:
             _write_to(self._gains[name], gain)
 
     def apply(self, change: Change) -> None:
-        """Apply a recorded change; the next tick must be its first, or later."""
+        """Apply a recorded change; the next tick must be its first, or later.
+
+        Raises LawError if the law does not have such gains.
+        """
         if change.gains is not None:
+            for name, gain in change.gains.named.items():
+                if name not in self._gains or len(gain) != len(self._gains[name]):
+                    raise LawError(f"law {self.law.settings.kind} has no gain {name} of {len(gain)} numbers")
             self.set_gains(change.gains)
         self.motion.change(change, self.period)
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol import plugins
 from aeroloop.protocol.errors import AeroloopError, ConfigError
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.service.config import as_overrides
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.engine import local_processes
@@ -42,14 +43,17 @@ class LogCheck(BaseModel, frozen=True):
     digests: list[str] = Field(default=[], description="of the computed commands of each session")
     accepted: bool = Field(default=False, description="whether these differences were accepted before")
     notes: list[str] = Field(default=[], description="what could not be compared or run, and why")
-    error: str | None = Field(default=None, description="why it could not be checked at all")
+    error: str | None = Field(default=None, description="why it, or an end of it, could not be checked at all")
+    unseen: list[str] = Field(
+        default=[], description="what was not compared: rows that the log lacks, or that cannot be computed from it"
+    )
     before: Figures | None = Field(default=None, description="of the longest session, as recorded")
     after: Figures | None = Field(default=None, description="of its closed loop, run again")
 
     @property
     def same(self) -> bool:
-        """Whether nothing differs that was not accepted."""
-        return self.error is None and (self.accepted or not self.first)
+        """Whether everything was compared and nothing differs that was not accepted."""
+        return self.error is None and not self.unseen and (self.accepted or not self.first)
 
 
 def logs_of(paths: Sequence[Path]) -> list[list[Path]]:
@@ -97,10 +101,10 @@ def check_logs(
     checked = [results[i] for i in range(len(logs))]
     if accept:
         for one in checked:
-            if not one.same and one.error is None:
+            if one.first and not one.accepted and one.error is None:
                 with writing(_beside(one.log), force=True) as part:
                     part.write_text(json.dumps(_outcome(one), indent=1) + "\n", encoding="utf-8")
-        checked = [one if one.error else one.model_copy(update={"accepted": not one.same}) for one in checked]
+        checked = [one if one.error else one.model_copy(update={"accepted": bool(one.first)}) for one in checked]
     return checked
 
 
@@ -119,11 +123,11 @@ def _check_log(files: Sequence[Path], overrides: Sequence[str]) -> LogCheck:
         done = replay(files, overrides)
     except AnotherWireError as error:
         found["first"] = [str(error)]
-    except ConfigError as error:
-        if not isinstance(error, plugins.PluginError) or (overrides and not isinstance(error, plugins.UntrustedError)):
-            raise  # the overrides are wrong
-        return LogCheck(log=name, error=str(error))
     except AeroloopError as error:
+        names_class = any(override.startswith(("law.kind", "plant.kind")) for override in overrides)
+        of_log = isinstance(error, PluginError) and not names_class
+        if overrides and isinstance(error, ConfigError) and not of_log:
+            raise
         return LogCheck(log=name, error=str(error))
     else:
         if done.controller is not None:
@@ -131,8 +135,11 @@ def _check_log(files: Sequence[Path], overrides: Sequence[str]) -> LogCheck:
         if done.plant is not None:
             found |= {"plant_ticks": done.plant.ticks, "plant_differ": done.plant.differ}
         found |= {"first": done.first_differences, "digests": [one.digest for one in done.sessions]}
-        notes += [line for lines in done.unseen.values() for line in lines]
+        unseen = dict.fromkeys(line for lines in done.unseen.values() for line in lines)
+        found |= {"unseen": list(unseen), "error": "; ".join(done.failed.values()) or None}
         notes += [f"{end}: {reason}" for end, reason in done.reasons.items() if not overrides]
+        notes += [f"not read: {line}" for line in done.damages if line not in unseen]
+        notes += [f"not judged: {line}" for line in done.others]
     try:
         again = fork(files, 0, overrides=overrides)
         found |= {"before": again.recorded and again.recorded.figures, "after": again.figures}

@@ -49,7 +49,7 @@ from aeroloop.service.logs.outputs import check_output, writing_into
 from aeroloop.service.logs.recording import Progress, Recording
 from aeroloop.service.logs.replay import TickDifference, tick_difference
 from aeroloop.service.logs.session import Integers, Session
-from aeroloop.service.logs.ticks import LoggedController, Ticks
+from aeroloop.service.logs.ticks import LoggedController, Ticks, without
 from aeroloop.service.review.review import Review, read
 
 REPLAYED: Final = 0.6  # share of the progress when both ends have been computed again
@@ -322,15 +322,12 @@ class _Changes:
         law, before = law_class(settings.law), recorded.settings
         keys = [override.partition("=")[0].strip() for override in overrides]
         given = {name: getattr(settings.law, name) for name in law.gains if f"law.{name}" in keys}
-        replaced: dict[str, None] = {}
         if given:
             with_gains(settings.law, Gains.model_validate(given))  # raises LawError
-            replaced["gains"] = None
         follows = any(key.startswith("reference") for key in keys)
-        if follows:
-            replaced["reference"] = None
         past = [change for change in recorded.changes if change.tick <= tick]
-        future = [change.model_copy(update=replaced) for change in recorded.changes if change.tick > tick]
+        replaced = [key for key in keys if key != "law.kind"]
+        future = [without(change, replaced) for change in recorded.changes if change.tick > tick]
         if another := settings.law.kind != before.law.kind:
             given = gains_of(settings.law).named | given
             past, future = ([each.model_copy(update={"gains": None}) for each in some] for some in (past, future))

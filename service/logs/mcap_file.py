@@ -50,14 +50,23 @@ class NotMcapError(ValueError):
     """The file does not begin as an MCAP file does."""
 
 
+class FileEndsError(ValueError):
+    """The file ends where a record should begin or go on, as a recorder leaves it that was killed."""
+
+
 def records(
-    path: Path, damages: list[str] | None = None, progress: Callable[[int], None] | None = None
+    path: Path,
+    damages: list[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+    unfinished: list[str] | None = None,
 ) -> Iterator[McapRecord]:
     """Schemas, channels, messages, metadata and attachments in the file's order; damaged ones are left out.
 
     Schemas and channels of an index come first, so that a damaged chunk loses no other chunk's description. What could
-    not be read is appended to `damages`, each with its byte and the time of the last message before it; `progress` is
-    called with the bytes read so far. Raises NotMcapError, or OSError if the file cannot be read.
+    not be read is appended to `damages`, each with its byte and the time of the last message before it; that the file
+    ends without its index, to `unfinished` instead, if that is given. `progress` is called with the bytes read so far.
+
+    Raises NotMcapError, or OSError if the file cannot be read.
     """
     last_ns = 0
     with path.open("rb") as file:
@@ -71,8 +80,11 @@ def records(
                 found = _contents(record) if isinstance(record, Chunk) else [record]
             except _MALFORMED as error:
                 after = f", after {datetime.fromtimestamp(last_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC" * bool(last_ns)
-                if damages is not None:
-                    damages.append(f"{error or 'a record ends too early'} (byte {at}{after})")
+                lines = damages
+                if isinstance(error, FileEndsError) and index is None and unfinished is not None:
+                    lines = unfinished
+                if lines is not None:
+                    lines.append(f"{error or 'a record ends too early'} (byte {at}{after})")
                 if index is None:
                     return
             else:
@@ -120,13 +132,13 @@ def _record(file: BinaryIO, at: int, opcode: int | None) -> McapRecord:
     file.seek(at)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
-        raise ValueError("the file is cut here" if head else "the file ends here, without its index")
+        raise FileEndsError("the file is cut here" if head else "the file ends here, without its index")
     kind, length = _HEAD.unpack(head)
     if not 0 < kind <= Opcode.DATA_END or length > MAX_CHUNK:
         raise ValueError("no record begins here")
     content = file.read(length)
     if len(content) < length:
-        raise ValueError(f"the file is cut within a record of {_HEAD.size + length} bytes")
+        raise FileEndsError(f"the file is cut within a record of {_HEAD.size + length} bytes")
     if opcode not in (None, kind):
         raise ValueError("the record that the index has here is damaged")
     record = next(StreamReader(BytesIO(head + content), skip_magic=True, emit_chunks=True).records)

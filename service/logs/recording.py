@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil, inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mcap.records import Channel, Message, Metadata
 from pydantic_core import from_json
@@ -24,11 +24,13 @@ from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, NotMcapError, records
 from aeroloop.service.logs.session import (
     Entry,
+    Missing,
     Session,
     SessionKey,
     Source,
     TraceIndex,
     Truths,
+    Unknown,
     join,
     table_of,
     true_states,
@@ -47,6 +49,28 @@ _Copy = tuple[Path, int, str | bytes, Address | None]
 """A copy of a description: file, time of publication [ns since 1970] (0 in the metadata), text and key."""
 
 
+class Judged(NamedTuple):
+    """What a verdict on a session's vehicle is about, and what not.
+
+    Attributes:
+        sessions: In the order of recording: the session itself, those of which both ends have rows, and all others of
+            the processes that have these.
+        processes: That have one of the sessions.
+        missing: Rows of the sessions that the log lacks.
+        unknown: Ticks of the sessions of which the log does not hold what was in force.
+        damages: What of the files is cut or damaged, a line each. That a file ends without its index, as a recorder
+            leaves it that was killed, is a damage only if rows are missing, or if it is the last and no session's end.
+        others: Sessions of the log that are not judged, a line each.
+    """
+
+    sessions: list[SessionKey]
+    processes: set[Source]
+    missing: list[Missing]
+    unknown: list[Unknown]
+    damages: list[str]
+    others: list[str]
+
+
 class ReviewError(AeroloopError):
     """A log cannot be reviewed; one line with the reason."""
 
@@ -61,11 +85,14 @@ class Recording:
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.metadata: dict[str, dict[str, Any]] = {}  # but descriptions, by name without its prefix `aeroloop.`
         self.messages: list[tuple[Address, Message]] = []  # of the topics MESSAGES, in the order of recording
-        self.damaged: list[str] = []  # what of the files is cut or damaged, a line each
+        self._damaged: list[str] = []  # what of the files is damaged, a line each
+        self._unfinished: dict[Path, str] = {}  # files that end without their index
+        self._undescribed: defaultdict[str, list[str]] = defaultdict(list)  # unreadable descriptions, by vehicle
         self.malformed: Counter[str] = Counter()  # messages by topic; they cost nothing else
         self._descriptions: defaultdict[tuple[str, str], list[tuple[int, Description]]] = defaultdict(list)
         self._index = TraceIndex()
         begins_ns, marks, copies = dict[Path, int](), dict[Path, set[object]](), list[_Copy]()
+        self._ends_ns: dict[object, int] = {}  # when each recording wrote its last message [ns since 1970]
         try:
             sizes, done = {path: path.stat().st_size for path in _files(paths)}, 0
             for path, size in sizes.items():
@@ -83,7 +110,7 @@ class Recording:
         self.paths = sorted(begins_ns, key=begins_ns.__getitem__)  # in the order of their first messages
         _check_that_all_are_of_one_run(marks)
         self._add_descriptions(copies)
-        self._index.finish()
+        self._index.finish(self._ends_ns)
         self.malformed["trace"] = self._index.malformed
         self.extents, self.missing, self.unknown = self._index.extents, self._index.missing, self._index.unknown
 
@@ -95,7 +122,9 @@ class Recording:
     @property
     def unread(self) -> list[str]:
         """What could not be read, a line each: damages, then malformed messages."""
-        return [*self.damaged, *(f"malformed: {n} of {topic}" for topic, n in sorted(self.malformed.items()) if n)]
+        undescribed = [line for lines in self._undescribed.values() for line in lines]
+        malformed = (f"malformed: {n} of {topic}" for topic, n in sorted(self.malformed.items()) if n)
+        return [*self._damaged, *self._unfinished.values(), *undescribed, *malformed]
 
     # ── sessions ──
 
@@ -111,7 +140,7 @@ class Recording:
         if not known:
             vehicles = ", ".join(dict.fromkeys(vehicle for vehicle, _ in self.extents))
             raise ReviewError(f"{self.name} holds no session of {vehicle}, only of {vehicles}")
-        longest = max(known, key=lambda which: self.extents[which].ticks)
+        longest = max(known, key=lambda which: sum(self.extents[which].rows.values()))
         if session is None:
             return longest
         numbered = self.sessions_of(longest[0])
@@ -122,6 +151,30 @@ class Recording:
         names = ", ".join(f"{i} {which[1]}" for i, which in enumerate(numbered[:20], 1))
         more = f" and {len(numbered) - 20} more" if len(numbered) > 20 else ""
         raise ReviewError(f"{self.name} holds no session {session!r}; of {longest[0]} it holds {names}{more}")
+
+    def judged(self, session: SessionKey) -> Judged:
+        """What a verdict on a session's vehicle is about.
+
+        Why not all of the log: anybody on the network may publish a batch, of a vehicle, a session or a process of
+        their own, and the recorder records every vehicle.
+        """
+        vehicle, owners = session[0], self._index.owners
+        corroborated = {key for key in self._index.corroborated if key[0] == vehicle} | {session}
+        processes = {process for key in corroborated for process in owners[key].values()}
+        sessions = [key for key in self.sessions_of(vehicle) if not processes.isdisjoint(owners[key].values())]
+        names = {"", *(name for _, name in sessions)}
+        missing = [gap for gap in self.missing if gap.vehicle == vehicle and gap.session in names]
+        unknown = [gap for gap in self.unknown if (gap.vehicle, gap.session) in sessions]
+        damages = [*self._damaged, *self._undescribed.get(vehicle, ())]
+        for path, line in self._unfinished.items():
+            is_last = path == self.paths[-1]
+            if any(gap.rows or is_last for gap in missing):
+                damages.append(line)
+        others: list[str] = []
+        for key, extent in self.extents.items():
+            if key not in sessions:
+                others.append(f"{'/'.join(key)}, {sum(extent.rows.values())} rows")
+        return Judged(sessions, processes, missing, unknown, damages, others)
 
     def sessions_of(self, vehicle: str) -> list[SessionKey]:
         """Sessions of a vehicle, in the order of recording."""
@@ -236,8 +289,9 @@ class Recording:
         """Add all copies of descriptions in the order of publication. Raises ReviewError if none is readable.
 
         One that is not is a malformed message; in the metadata, which the recorder writes, or as the only one of an
-        end it is a damage. Why: without it, the other end's configuration stands for it.
+        end that has a trace it is a damage. Why: without it, the other end's configuration stands for it.
         """
+        traced = {(source.vehicle, source.end) for source in self._index.entries}
         unreadable = list[tuple[Path, int, Address | None, str]]()
         for path, at_ns, text, address in sorted(copies, key=lambda one: one[1]):
             try:
@@ -248,11 +302,13 @@ class Recording:
         if unreadable and not self._descriptions:
             raise ReviewError(f"{unreadable[0][0]} is not a log of this version: {unreadable[0][3]}")
         for path, at_ns, address, why in unreadable:
-            known = address is None or address.role not in ENDS or (address.vehicle, address.role) in self._descriptions
-            if at_ns and known:
+            end = None if address is None else (address.vehicle, address.role)
+            if at_ns and (end not in traced or end in self._descriptions):
                 self.malformed["description"] += 1
+            elif address is None:
+                self._damaged.append(f"{path}: a description: {why}")
             else:
-                self.damaged.append(f"{path}: a description: {why}")
+                self._undescribed[address.vehicle].append(f"{path}: a description: {why}")
 
     # ── files ──
 
@@ -264,8 +320,9 @@ class Recording:
         """
         addresses: dict[int, Address | None] = {}
         begin_ns, marks, damages = 0, set[object](), list[str]()
+        unfinished: list[str] = []
         identity: object = path
-        for record in records(path, damages, progress):
+        for record in records(path, damages, progress, unfinished):
             match record:
                 case Channel():
                     addresses[record.id] = topics.read_key(record.topic)
@@ -283,15 +340,18 @@ class Recording:
                             identity = content["id"]
                 case Message(publish_time=at_ns, data=data):
                     begin_ns = begin_ns or record.log_time
+                    self._ends_ns[identity] = max(self._ends_ns.get(identity, 0), record.log_time)
                     if (address := addresses.get(record.channel_id)) is None:
                         continue
                     if address.topic.name == "description":
                         copies.append((path, at_ns, data, address))
                     elif address.topic.name == "trace":
-                        marks |= self._index.add(address.vehicle, data, at_ns)
+                        marks |= self._index.add(address.vehicle, data, at_ns, identity, record.log_time)
                     elif address.topic.name in MESSAGES:
                         self.messages.append((address, record))
-        self.damaged += [f"{path}: {damage}" for damage in damages]
+        self._damaged += [f"{path}: {damage}" for damage in damages]
+        if unfinished:
+            self._unfinished[path] = f"{path}: {unfinished[0]}"
         return begin_ns, marks and {*marks, identity}
 
 

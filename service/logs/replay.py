@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -26,7 +25,7 @@ from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.logs.frames import Direction, differences
 from aeroloop.service.logs.recording import INDEXING, Progress, Recording, ReviewError
-from aeroloop.service.logs.session import Missing, SessionKey, Unknown
+from aeroloop.service.logs.session import Missing, SessionKey, Source, Unknown
 from aeroloop.service.logs.ticks import LoggedController
 
 
@@ -87,12 +86,20 @@ class Replay(BaseModel, frozen=True):
     reasons: dict[str, str] = Field(description="why an end could not be replayed, or not to its end")
     unknown: list[Unknown] = Field(description="ticks of which the log does not hold what was in force")
     sessions: list[SessionReplay]
-    plants: list[PlantReplayed] = Field(description="the plant's processes, in the order of recording")
+    plants: list[PlantReplayed] = Field(description="the plant's processes with rows, in the order of recording")
     missing: list[Missing] = Field(description="rows of the ends asked for that the log lacks")
     damages: list[str] = Field(description="unreadable parts of the log")
     unseen: dict[End, list[str]] = Field(
         description="by end that was asked for: what was not compared, since the log lacks it, is cut or damaged, or "
         "cannot be computed again from it"
+    )
+    failed: dict[End, str] = Field(
+        default={}, description="by end: why rows that another installation might compute again cannot be here"
+    )
+    others: list[str] = Field(
+        default=[],
+        description="sessions that are not judged: of other vehicles, or of processes of which no session has rows of "
+        "both ends",
     )
 
     @property
@@ -137,8 +144,9 @@ def replay(
     progress: Progress | None = None,
     ends: Collection[End] = ENDS,
     answering: Answering | None = None,
+    vehicle: str | None = None,
 ) -> Replay:
-    """Replay every session of a run.
+    """Replay the sessions of a run's vehicle, the longest session's if None, as of `Recording.judged`.
 
     With overrides, `section.key=value`, the controller is computed with another law instead, and the plant is not. An
     override of the gains or of the reference replaces every logged change of them.
@@ -148,22 +156,24 @@ def replay(
         ConfigError: An override is wrong.
     """
     recording = Recording(paths, progress)
-    recording.choose()  # raises where there is no session
+    judged = recording.judged(recording.choose(vehicle=vehicle))
     reasons: dict[str, str] = {end: "only the other end was replayed" for end in ENDS if end not in ends}
     unseen = dict[End, list[str]]()
     sessions, plants = list[SessionReplay](), list[PlantReplayed]()
     failed: dict[SessionKey, AeroloopError] = {}
+    failures: dict[End, str] = {}
     if "controller" in ends:
-        for which in (which for which, extent in recording.extents.items() if extent.rows["controller"]):
+        for which in (which for which in judged.sessions if recording.extents[which].rows["controller"]):
             try:
                 sessions.append(_replay_session(recording, which, overrides, progress, answering or Answering()))
             except AeroloopError as error:
                 if overrides:
                     raise
                 failed[which] = error
-        unseen["controller"] = [str(one) for one in recording.unknown]
+        unseen["controller"] = [str(one) for one in judged.unknown]
         if failed:
-            reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
+            failures["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
+            reasons["controller"] = failures["controller"]
             left = sum(recording.extents[which].rows["controller"] for which in failed)
             unseen["controller"].append(f"{left} of the controller's rows: {reasons['controller']}")
         elif not sessions:
@@ -171,25 +181,27 @@ def replay(
     if overrides:
         reasons["plant"] = "the plant of a log does not follow another configuration"
     elif "plant" in ends:
-        plants, reason, unseen["plant"] = _replay_plants(recording, progress)
+        plants, reason, unseen["plant"] = _replay_plants(recording, judged.processes, failures, progress)
         if reason is not None:
             reasons["plant"] = reason
     if failed and not (sessions or plants):
         raise next(iter(failed.values()))
-    missing = [gap for gap in recording.missing if gap.end in ends]
+    missing = [gap for gap in judged.missing if gap.end in ends]
     for end, its in unseen.items():
         lacks = [f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows]
-        unseen[end] = [*lacks, *its, *recording.damaged]
+        unseen[end] = [*lacks, *its, *judged.damages]
     return Replay(
         controller=_sum(sessions),
         plant=_sum([result for result in plants if result.ticks]),
         reasons=reasons,
-        unknown=recording.unknown,
+        unknown=judged.unknown,
         sessions=sessions,
         plants=plants,
         missing=missing,
         damages=recording.unread,
         unseen=unseen,
+        failed=failures,
+        others=judged.others,
     )
 
 
@@ -204,9 +216,10 @@ def _replay_session(
 ) -> SessionReplay:
     """Replay a session's controller. Raises AeroloopError if that cannot be."""
     settings = load_over(recording.settings(which), overrides)
-    parts: dict[Literal["gains", "reference"], str] = {"gains": "law.", "reference": "reference"}
-    ignored = [part for part, key in parts.items() if any(override.startswith(key) for override in overrides)]
     session = recording.session(which)
+    ignored = [override.partition("=")[0].strip() for override in overrides]
+    if settings.law.kind == session.settings.law.kind:
+        ignored = [key for key in ignored if key != "law.kind"]
     logged = LoggedController(session, settings, ignored=ignored, resumes=not overrides, made_by=answering.made_by)
     rows, wire = session.controller, settings.wire
     if wire.measurement.widths != session.settings.wire.measurement.widths:
@@ -258,18 +271,19 @@ def _with_signals(result: PlantReplayed, wire: WireSpec) -> PlantReplayed:
 
 
 def _replay_plants(
-    recording: Recording, progress: Progress | None
+    recording: Recording, processes: Collection[Source], failures: dict[End, str], progress: Progress | None
 ) -> tuple[list[PlantReplayed], str | None, list[str]]:
-    """Replay the plants of a run, each process from its first row with the configuration that it started with.
+    """Replay these processes of plants, each from its first row with the configuration that it started with.
 
     Returns the result of each process, the reason if there is none or one ends early, and which rows are not compared.
+    A class that cannot be had is put into `failures`.
     """
     results, reasons, unseen = list[PlantReplayed](), list[str](), list[str]()
     forked = recording.metadata.get("fork")
     if forked is not None:
         tick = forked.get("tick", "?")
         return [], f"a fork's plant begins in flight, at tick {tick}: only the log that was forked has its state", []
-    plants = list(recording.plants())
+    plants = [plant for plant in recording.plants() if plant[0] in processes]
     done, total = 0, max(1, sum(batch.header.rows for *_, batches in plants for batch in batches))
     for source, description, batches in plants:
         left, reason = sum(batch.header.rows for batch in batches), None
@@ -283,7 +297,7 @@ def _replay_plants(
                     continue
                 one = PlantReplay(its.loop, its.wire, its.plant)
             except (PlantError, PluginError) as error:
-                reason = str(error)
+                failures["plant"] = reason = str(error)
             else:
                 for batch in batches:
                     one.feed(batch)

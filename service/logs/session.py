@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -57,7 +58,10 @@ class Missing(BaseModel, frozen=True):
     end: Literal["controller", "plant"]
     first_tick: int = Field(description="the first tick of the session that may lack its row")
     last_tick: int | None = Field(description="the last; null where the session's length is not known")
-    rows: int = Field(description="how many are known to be missing; 0 where only the session's last batch is")
+    rows: int = Field(
+        description="how many are known to be missing, at least 1 where the session ended without its last batch; 0 "
+        "where the recording ended first"
+    )
 
     def __str__(self) -> str:
         if not self.session:
@@ -100,6 +104,10 @@ class Extent(NamedTuple):
 
 _MOST: Final = 1 << 62  # more rows than any process publishes, and more nanoseconds than any clock counts
 
+WENT_ON_NS: Final = 2_000_000_000
+"""A recording that goes on for longer after a session's last batch than batches take has lost the session's end: a
+process publishes ten batches a second, and a recorder writes twice a second."""
+
 Ranges = Sequence[tuple[int, int]]  # first and last tick of each
 
 
@@ -130,6 +138,13 @@ class Entry(NamedTuple):
         return self.header.first_row + self.header.rows
 
 
+class _Newest(NamedTuple):
+    """The last batch of a process's session: the row after it, and when each recording wrote it [ns since 1970]."""
+
+    after: int
+    recorded_ns: dict[object, int]
+
+
 class TraceIndex:
     """Which batches a run's traces have; after `finish`, also what they lack."""
 
@@ -142,16 +157,30 @@ class TraceIndex:
         self.parts: defaultdict[tuple[SessionKey, End], list[Entry]] = defaultdict(list)  # likewise
         self.payloads = bytearray()  # one object: many small ones would not return 140 MB an hour to the system
         self.malformed = 0  # batches that are malformed, or of no process of the session
+        self.owners: defaultdict[SessionKey, dict[End, Source]] = defaultdict(dict)  # the process of each end
+        self.corroborated: set[SessionKey] = set()  # sessions of which both ends have rows
         self._known: set[int] = set()
+        self._newest: dict[tuple[Source, str], _Newest] = {}  # of a process's session
 
-    def add(self, vehicle: str, payload: bytes, published_ns: int) -> set[object]:
-        """Add a batch, once; returns its process and session. A malformed one is dropped and counted."""
+    def add(
+        self, vehicle: str, payload: bytes, published_ns: int, recording: object = None, recorded_ns: int = 0
+    ) -> set[object]:
+        """Add a batch, once; returns its process and session. A malformed one is dropped and counted.
+
+        `recorded_ns` is when a recording wrote it, on the clock of its recorder.
+        """
         batch = read_batch(payload)
         if batch is None or max(batch.header.first_row, batch.header.monotonic_ns) >= _MOST:
             self.malformed += 1
             return set()
         header, tail = batch.header, batch.tail
         source, session = Source(vehicle, header.end, header.run), header.session
+        after = header.first_row + header.rows
+        newest = self._newest.setdefault((source, session), _Newest(after, {}))
+        if after > newest.after:
+            newest = self._newest[source, session] = _Newest(after, {})
+        if after == newest.after:
+            newest.recorded_ns[recording] = recorded_ns
         if (identity := hash((source, payload))) not in self._known:
             self._known.add(identity)
             changes = [change for change in tail.changes if change.session == session]
@@ -164,9 +193,13 @@ class TraceIndex:
             self.entries[source].append(entry)
         return {source, (vehicle, session)} if session else {source}
 
-    def finish(self) -> None:
-        """Find sessions, and what the log lacks of them, once all batches are added."""
+    def finish(self, ends_ns: Mapping[object, int] = MappingProxyType({})) -> None:
+        """Find sessions, and what the log lacks of them, once all batches are added.
+
+        `ends_ns` is when each recording wrote its last message.
+        """
         self._sort_out()
+        self._leave_out_strays()
         for source, entries in self.entries.items():
             for entry in entries:
                 if entry.header.session:
@@ -188,7 +221,7 @@ class TraceIndex:
                 if proof > last:  # the other end proves rows after the last one
                     self._lacks(*which, end, last + 1, proof, proof - last)
                 elif not any(entry.header.final for entry in self.parts[which, end]):
-                    self._lacks(*which, end, last + 1, None, 0)
+                    self._lacks(*which, end, last + 1, None, 1 if self._went_on(which, end, ends_ns) else 0)
             self._find_unknown(which, max(extent.last["controller"], proofs["plant"]))
 
     def _sort_out(self) -> None:
@@ -201,17 +234,63 @@ class TraceIndex:
             after, kept = 0, list[Entry]()
             # one without rows precedes the batch that starts at the same row
             for entry in sorted(entries, key=lambda e: (e.header.first_row, e.header.rows > 0, e.header.monotonic_ns)):
-                if not entry.header.rows or entry.header.first_row >= after:
+                if entry.header.first_row >= after:
                     kept.append(entry)
                     after = max(after, entry.after)
                     rows[source.vehicle, source.end, entry.header.session][source] += entry.header.rows
             self.malformed += len(entries) - len(kept)
             self.entries[source] = kept
-        owners = {which: counts.most_common(1)[0][0] for which, counts in rows.items()}
+        for (vehicle, end, session), counts in rows.items():
+            if session:
+                self.owners[vehicle, session][end] = counts.most_common(1)[0][0]
         for source, entries in self.entries.items():
-            its = {""} | {session for (*_, session), owner in owners.items() if owner == source}
+            its = {""} | {session for (_, session), owners in self.owners.items() if owners.get(source.end) == source}
             self.entries[source] = [entry for entry in entries if entry.header.session in its]
             self.malformed += len(entries) - len(self.entries[source])
+
+    def _leave_out_strays(self) -> None:
+        """Leave out batches of which the rest of their process's trace shows that it did not publish them.
+
+        One is of a session that had ended before the rows that are missing before it. Another is alone between missing
+        rows and of a session of which the log has nothing else, while both ends have rows of others of the process.
+        """
+        batches: Counter[tuple[SessionKey, End]] = Counter()
+        for source, entries in self.entries.items():
+            batches.update(((source.vehicle, one.header.session), source.end) for one in entries if one.header.rows)
+        for session in self.owners:
+            if all(batches[session, end] for end in ENDS):
+                self.corroborated.add(session)
+        for source, entries in self.entries.items():
+            keys = [(source.vehicle, entry.header.session) for entry in entries]
+            is_corroborated = not self.corroborated.isdisjoint(keys)
+            first_rows = {entry.header.first_row for entry in entries if entry.header.rows}
+            next_rows = {entry.after for entry in entries if entry.header.rows} | {0}
+            ended_at: dict[SessionKey, int] = {}  # the row after a session's last one
+            kept: list[Entry] = []
+            for key, entry in zip(keys, entries, strict=True):
+                is_after_end = entry.header.first_row > ended_at.get(key, _MOST)
+                is_alone = entry.header.first_row not in next_rows and entry.after not in first_rows
+                is_only_one = key not in self.corroborated and batches[key, source.end] == 1
+                if is_after_end or (is_corroborated and is_alone and is_only_one):
+                    continue
+                kept.append(entry)
+                if entry.header.final:
+                    ended_at[key] = entry.after
+            self.malformed += len(entries) - len(kept)
+            self.entries[source] = kept
+
+    def _went_on(self, session: SessionKey, end: End, ends_ns: Mapping[object, int]) -> bool:
+        """Whether the recording went on after the last batch of a session, which has no end in it."""
+        vehicle, name = session
+        if (owner := self.owners[session].get(end)) is None:
+            return False
+        newest = self._newest[owner, name]
+        if any(ends_ns.get(recording, at_ns) - at_ns > WENT_ON_NS for recording, at_ns in newest.recorded_ns.items()):
+            return True
+        # A plant has one session at a time, so a later one shows that this one has ended.
+        last_ns = max((entry.published_ns for entry in self.parts[session, "plant"]), default=_MOST)
+        later = (other for other in self.corroborated if other[0] == vehicle and other != session)
+        return any(min(entry.published_ns for entry in self.parts[other, "plant"]) > last_ns for other in later)
 
     def _find_gaps(self, source: Source, having: Sequence[Entry]) -> None:
         """Find missing rows between the batches of a process that have rows or end a session."""
@@ -288,11 +367,33 @@ def _changes(entries: Sequence[Entry]) -> list[Change]:
     """All changes in order: those of the batches, and of records those that no batch has."""
     found = [change for entry in entries for change in entry.changes]
     had = {(change.tick, part) for change in found for part in _parts(change)}
+    recorded_gains: dict[int, Change] = {}  # by the tick since when they are in force
     for change in (change for entry in entries for change in entry.record):
+        if change.gains is not None:
+            recorded_gains[change.tick] = change
         if not had.issuperset(its := {(change.tick, part) for part in _parts(change)}):
             had |= its
             found.append(change)
-    return sorted(found, key=lambda change: change.tick)
+    return _with_whole_gains(sorted(found, key=lambda change: change.tick), recorded_gains)
+
+
+def _with_whole_gains(changes: Sequence[Change], recorded: Mapping[int, Change]) -> list[Change]:
+    """Changes in order of which those that a record contradicts have its gains: the batch of an earlier one is lost.
+
+    A change may set some of the gains; a record has all of them, as they are after the last change of its tick.
+    """
+    last_of_tick = {change.tick: i for i, change in enumerate(changes) if change.gains is not None}
+    whole = list(changes)
+    gains: dict[str, tuple[float, ...]] = {}
+    for i, change in enumerate(changes):
+        if change.gains is None:
+            continue
+        gains |= change.gains.named
+        record = recorded.get(change.tick) if last_of_tick[change.tick] == i else None
+        if record is not None and record.gains is not None and record.gains.named != gains:
+            gains = dict(record.gains.named)
+            whole[i] = change.model_copy(update={"gains": record.gains})
+    return whole
 
 
 def _parts(change: Change) -> list[str]:

@@ -7,19 +7,20 @@ again, bit for bit; after missing rows, the log has the controller's state.
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from math import nan
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.operator import Change, Gains
 from aeroloop.protocol.messages.trace import Received, Sent
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.frames import FrameFormat
@@ -95,9 +96,10 @@ class Recomputed(NamedTuple):
 class LoggedController:
     """The controller of a session, which answers its rows again, one after the other.
 
-    With other `settings` than the session's, parts of the logged changes may be `ignored`. It `resumes` from the
-    recorded state where rows are missing. `made_by` is the class of its controller. `state_before` is the law's state
-    before the last row. Of a session as of `with_known_law` whose law is unknown, it computes all but the law.
+    With other `settings` than the session's, logged changes of what they set may be `ignored`: keys of the
+    configuration, such as `law.C2` or `reference.kind`. It `resumes` from the recorded state where rows are missing.
+    `made_by` is the class of its controller. `state_before` is the law's state before the last row. Of a session of
+    `with_known_law` whose law is unknown, it computes all but the law.
     """
 
     def __init__(
@@ -105,7 +107,7 @@ class LoggedController:
         session: Session,
         settings: Settings | None = None,
         *,
-        ignored: Collection[Literal["gains", "reference"]] = (),
+        ignored: Collection[str] = (),
         resumes: bool = True,
         made_by: type[Controller] = Controller,
     ) -> None:
@@ -115,10 +117,10 @@ class LoggedController:
         self._rows = session.controller
         self._states = {i: state for i, state in session.states.items() if resumes or i == 0}
         self._changes: deque[Change] = deque(session.changes)
-        self._ignored: dict[str, None] = dict.fromkeys(ignored)
+        self._ignored = set(ignored)
         if isinstance(settings.law, UnknownLawSettings):
             self.controller.leave_out_law()
-            self._ignored["gains"] = None
+            self._ignored.add("law.kind")
 
     def answers(self, progress: Progress | None = None) -> Iterator[bytes | None]:
         """The command that answers each row: a frame, UNCHANGED, or None. Raises ReviewError as `resume`."""
@@ -140,9 +142,9 @@ class LoggedController:
                 progress(min(1.0, (begin + AT_A_TIME) / len(rows)))
 
     def change(self, k: int) -> None:
-        """Apply the logged changes of gains and reference up to tick k."""
+        """Apply the logged changes of gains and reference up to tick k. Raises LawError as `Controller.apply`."""
         while self._changes and self._changes[0].tick <= k:
-            self.controller.apply(self._changes.popleft().model_copy(update=self._ignored))
+            self.controller.apply(without(self._changes.popleft(), self._ignored))
 
     def resume(self, i: int) -> None:
         """Continue from the state before row i, where the log has it. Raises ReviewError if it is of no controller."""
@@ -173,6 +175,18 @@ def with_known_law(session: Session) -> tuple[Session, str | None]:
         unknown = UnknownLawSettings.model_validate(settings.law.model_dump())
         return replace(session, settings=settings.model_copy(update={"law": unknown})), str(error)
     return session, None
+
+
+def without(change: Change, keys: Collection[str]) -> Change:
+    """A change without what these keys of the configuration set: a reference, gains; with `law.kind` all gains."""
+    kept = change
+    if any(key == "reference" or key.startswith("reference.") for key in keys):
+        kept = kept.model_copy(update={"reference": None})
+    if change.gains is not None:
+        gains = {name: gain for name, gain in change.gains.named.items() if f"law.{name}" not in keys}
+        has_any = bool(gains) and "law.kind" not in keys
+        kept = kept.model_copy(update={"gains": Gains.model_validate(gains) if has_any else None})
+    return kept
 
 
 def recompute(session: Session, progress: Progress | None = None) -> Recomputed:
@@ -257,6 +271,8 @@ def _compute_missed(session: Session, missed: Integers, columns: dict[str, Array
     logged.resume(0)
     controller, plant = logged.controller, session.plant
     controller.leave_out_law()
+    state = controller.last_valid["state_next"]
+    state_kept = array("d", state)
     # a silent row repeats the levels of the frame before it, if no row between them is missing or left out
     framed = np.maximum.accumulate(np.where(plant["sent_as"] == Sent.FRAME, np.arange(len(plant)), -1))
     gaps = [gap.last_tick for gap in session.missing if gap.end == "plant" and gap.rows and gap.last_tick is not None]
@@ -271,12 +287,15 @@ def _compute_missed(session: Session, missed: Integers, columns: dict[str, Array
             followed = before[place]
             for name in ("q", "state_next"):
                 controller.last_valid[name][:] = memoryview(columns[name][followed].copy())
+            state_kept = array("d", state)
         tick = int(session.k[place])
         logged.change(tick)
         controller.tick(plant["measurement"][source].tobytes(), tick)
         if controller.outputs["measured"][0]:
             for name, column in columns.items():
                 column[place] = controller.outputs[name]
+            columns["state_next"][place] = state_kept
+        state[:] = memoryview(state_kept)  # what the law would have done is not what it did
 
 
 def _gains(session: Session, k: Integers) -> Array:

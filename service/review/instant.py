@@ -60,7 +60,9 @@ class Instant(BaseModel, frozen=True):
     command: Frame
     values: dict[str, float | bool | None] = Field(description="empty where the tick has no valid measurement")
     gains: dict[str, list[float]]
-    state_after: dict[str, list[float]] = Field(description="of the law; `values` has what it used")
+    state_after: dict[str, list[float]] = Field(
+        description="of the law; `values` has what it used; empty where the controller did not compute the tick"
+    )
     coordinates: dict[str, list[float]] = Field(
         description="z₁, z₂ of the measurement, ‖z‖; V (C.24) where the plant's damping is known; the paper's law only"
     )
@@ -144,6 +146,7 @@ class Instants:
             rows[name] = table[places[place]] if known and places[place] >= 0 else None
         i = int(np.searchsorted(self._ticks.k, tick))
         valid = i < len(self._ticks.k) and self._ticks.k[i] == tick
+        computed = valid and not np.isnan(self._ticks.state[i]).any()
         columns = self._columns(slice(i, i + 1)) if valid else []
         skipped = ("tick", "time_s", "published_ns", "vehicle", "session")
         values = {column.name: _value(column) for column in columns if column.name not in skipped}
@@ -161,7 +164,7 @@ class Instants:
             command=self._frame("command", controller, acted, tick),
             values=values,
             gains=_split(self._gains, self._ticks.gains[i]) if valid else {},
-            state_after=_split(self._state, self._ticks.state_next[i]) if valid else {},
+            state_after=_split(self._state, self._ticks.state_next[i]) if computed else {},
             coordinates=self._coordinates(i) if valid else {},
             clocks_s=dict.fromkeys(seconds) if self.settings.loop.lockstep else seconds,
             notes=[*self._notes(tick, plant, controller, acted), *_saturated(values), *self._without_law()],

@@ -94,8 +94,9 @@ def read(
             raise ReviewError(f"there is nothing {_in_words(part)}: the session has {lasts:g} s")
         span = int(its.k[0]), int(its.k[-1])
         since, until = since_s / loop.period, until_s / loop.period
-        unseen = [one for one in unseen if one.first_tick <= until and (one.last_tick or inf) >= since]
+        unseen = [gap for gap in unseen if gap.first_tick <= until and _last_tick(gap) >= since]
     messages = events.read_messages(recording, which, settings.wire.actuators)
+    whole = recording.judged(which)
     recording.release()
     marks, trips, losses = events.happened(messages, its, span, session is not None)
     faults = events.fault_intervals(messages, its)
@@ -126,7 +127,7 @@ def read(
     theorem = check_theorem(settings, ticks, messages.truths, its.changes, certificate, faults=bool(faults))
     gap_count, longest = events.gaps(judged.answered, loop.period)
     saturated, invalid = events.saturation(settings.wire, judged.measurements, judged.commands)
-    missing = [gap for gap in recording.missing if gap.vehicle == which[0]]
+    missing = whole.missing
     started_s = ticks.wall_ns[:1] * 1e-9
     recorded = [
         Recorded(vehicle=owner, session=one, duration_s=round(extent.ticks * loop.period, 9))
@@ -142,7 +143,7 @@ def read(
         gaps=longest, gap_count=gap_count, saturated=saturated, invalid=invalid, losses=losses, lapses=went,
         missing_ticks={role: sum(gap.rows for gap in missing if gap.end == role) for role in ENDS}, missing=missing,
         unknown=its.unknown, law_unknown=law_unknown,
-        unseen={"missing_ticks": [str(one) for one in unseen], "damages": recording.damaged},
+        unseen={"missing_ticks": [str(one) for one in unseen], "damages": whole.damages},
     )  # fmt: skip
     path = paths[0].resolve()
     name = path.name if path.is_dir() else path.stem
@@ -161,6 +162,10 @@ def _facts(recording: Recording, session: Session, messages: events.Messages) ->
         if isinstance(status, Status) and status.notes:
             facts.setdefault(role, {})["notes"] = status.notes
     return facts
+
+
+def _last_tick(gap: Missing | Unknown) -> float:
+    return inf if gap.last_tick is None else gap.last_tick
 
 
 def _in_words(part: tuple[float, float]) -> str:

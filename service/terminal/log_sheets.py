@@ -232,6 +232,7 @@ def replay_sheets(replay: Replay) -> Sheets:
     lines += [f"controller: {_replayed(replay, 'controller')}", f"plant: {_replayed(replay, 'plant')}"]
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
+    lines += [f"not judged: {line}" for line in _some(replay.others)]
     yield "\n".join(lines), []
 
 
@@ -322,8 +323,12 @@ def check_sheets(checked: Sequence[LogCheck]) -> Sheets:
                 row[f"{figure.key} {figure.unit}"] = " → ".join(texts) if len(both) == 2 else "–"
         shown.append(row)
     yield "", shown
-    if notes := [f"{Path(one.log).name}: {line}" for one in checked for line in _some(one.notes)]:
-        yield "\n".join(notes), []
+    lines = list[str]()
+    for one in checked:
+        unseen = [f"not compared: {line}" for line in one.unseen]
+        lines += [f"{Path(one.log).name}: {line}" for line in (*_some(unseen), *_some(one.notes))]
+    if lines:
+        yield "\n".join(lines), []
 
 
 def _replayed(replay: Replay, name: End) -> str:

@@ -72,6 +72,20 @@ def test_the_golden_batch_of_the_plant_is_what_the_writer_writes() -> None:
     assert writer.take(5_004_100_000, 1_800_000_000_004_100_000, final=True).hex(" ") == batch.hex(" ")
 
 
+def test_a_command_that_was_received_long_before_its_tick_keeps_its_time() -> None:
+    """As of a plant that was halted: the first row of its next batch acts on it."""
+    writer = TraceWriter("plant", WIRE, 1)
+    row = PlantRow(0, 0, 1, 1, 1, 0, -1, 60 * S, 20 * S, bytes(7), bytes(3), (0.0, 0.0))
+    writer.row(row)
+    writer.row(row._replace(tick=1, sent_ns=60 * S + 2_000_000, received_ns=60 * S + 1_000_000))
+    assert not writer.due(60 * S + 50_000_000)
+    assert writer.due(60 * S + 100_000_000)
+    batch = read_batch(writer.take(61 * S, 0))
+    assert batch is not None
+    assert batch.times_ns("received").tolist() == [20 * S, 60 * S + 1_000_000]
+    assert batch.times_ns("sent").tolist() == [60 * S, 60 * S + 2_000_000]
+
+
 at_ns = st.integers(10 * S, 12 * S)
 ticks = st.integers(0, 2**32 - 2)
 acts = st.integers(0, 3)

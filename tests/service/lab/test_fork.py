@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import runpy
+import shutil
+import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +17,7 @@ import pytest
 import aeroloop
 from aeroloop.protocol.errors import AeroloopError, ConfigError
 from aeroloop.protocol.messages.trace import read_batch
+from aeroloop.service import examples
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load, load_over
 from aeroloop.service.lab.check import check_log, check_logs, logs_of
@@ -20,11 +26,11 @@ from aeroloop.service.lab.fork import REPLAYED, ForkError, fork
 from aeroloop.service.logs.recording import Recording, ReviewError
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.session import Session
-from aeroloop.service.logs.ticks import euler_deg
+from aeroloop.service.logs.ticks import euler_deg, without
 from aeroloop.service.review.review import read
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws, own_plants
-from tests.support.edited_log import Said, contents, rewrite
+from tests.support.edited_log import Said, contents, edited, rewrite
 from tests.support.in_this_process import run_here
 from tests.support.made_log import (
     AN_OPERATORS_WORDS,
@@ -387,6 +393,158 @@ def test_what_is_accepted_is_expected_and_anything_else_is_not(tmp_path: Path) -
     assert execute(words[:-1]) == 0  # equal needs no acceptance
     (tmp_path / "a.accepted.json").write_text("{}")
     assert execute([*words, MORE_DAMPING]) == 1
+
+
+OWN_LAW = """
+from tests.support import own_laws
+
+
+class Settings(own_laws.PDSettings):
+    pass
+
+
+class Mine(own_laws.Expressions):
+    Settings = Settings
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, Path]]:
+    """A log of a law in a file of the user's own, and the file."""
+    file = tmp_path / "a_law_of_mine.py"
+    file.write_text(OWN_LAW)
+    monkeypatch.syspath_prepend(tmp_path)
+    make_log(log := tmp_path / "a.mcap", 200, settings=lockstep(f"law.kind={file.stem}:Mine"))
+    yield log, file
+    sys.modules.pop(file.stem, None)
+
+
+def rewrite_module(file: Path, text: str) -> None:
+    """Change a module's source as an editor does between two runs of Python."""
+    file.write_text(text)
+    shutil.rmtree(file.parent / "__pycache__", ignore_errors=True)
+    sys.modules.pop(file.stem, None)
+    importlib.invalidate_caches()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("class Mine(", "class Yours(", "has no Mine"),
+        ("    Settings = Settings", '    Settings = Settings\n    gains = ("kp", "gone")', "gone"),
+        ("class Mine(", "import gone\n\nclass Mine(", "gone"),
+        ("class Mine(", "class Mine((", "SyntaxError"),
+    ],
+    ids=["class renamed", "gain renamed", "bad import", "syntax error"],
+)
+def test_a_law_that_cannot_be_computed_is_no_equal_law(
+    own: tuple[Path, Path], capsys: pytest.CaptureFixture[str], old: str, new: str, says: str
+) -> None:
+    """Of the log and in the shipped example of a test, which passes with the law as it was."""
+    log, file = own
+    example = runpy.run_path(str(Path(examples.__path__[0]) / "test_logs.py"))
+    judges = example["test_a_log_gives_the_same_commands_and_its_loop_tracks_no_worse"]
+    judges(log)
+    rewrite_module(file, OWN_LAW.replace(old, new))
+    with pytest.raises(AssertionError, match=says):
+        judges(log)
+    capsys.readouterr()
+    assert execute(["log", "check", str(log), "--json"]) == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["same"] is False
+    assert says in printed["logs"][0]["error"]
+    assert execute(["log", "check", str(log), "--accept"]) == 1
+    assert not log.with_name("a.accepted.json").exists()
+
+
+@pytest.mark.parametrize(("first", "last"), [(100, 200), (0, TICKS)], ids=["some rows", "the controller's trace"])
+def test_a_log_that_lacks_rows_is_not_equal_and_says_which(
+    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], first: int, last: int
+) -> None:
+    def lacking(one: Said) -> Said | None:
+        batch = read_batch(one.data) if one.key.endswith("trace/controller") else None
+        if batch is None:
+            return one
+        ticks = batch.columns["tick"]
+        is_lost = last == TICKS or (len(ticks) > 0 and first <= ticks[0] < last)
+        return None if is_lost else one
+
+    log = rewrite(corpus / "a.mcap", tmp_path / "a.mcap", lacking)
+    (found,) = check_logs([log], accept=True)
+    assert not found.same
+    assert (found.first, found.error) == ([], None)
+    assert any("of the controller's ticks in s1, ticks " in line for line in found.unseen)
+    assert execute(["log", "check", str(log)]) == 1
+    assert "a.mcap: not compared: " in " ".join(capsys.readouterr().out.split())
+
+
+def test_only_the_gains_that_are_overridden_replace_an_operators(tmp_path: Path) -> None:
+    """An override with the value of the log changes nothing; one gain leaves an operator's others as they are."""
+    settings = lockstep()
+    make_log(log := tmp_path / "a.mcap", 1000, settings=settings, changes=AN_OPERATORS_WORDS)
+    assert settings.law.kind == "adaptive"
+    inertia = settings.description()["law"]["inertia"]
+    for same in (f"law.inertia={json.dumps(inertia)}", "law.kind=adaptive"):
+        found = check_log([log], [same])
+        assert (found.same, found.differ) == (True, 0), same
+    gamma = check_log([log], ["law.Gamma=[0.03,0.03,0.03]"])
+    assert gamma.first[0].startswith("s1 at tick ")
+    assert replay([log], ["law.Gamma=[0.02,0.02,0.02]"]).sessions[0].first_difference is not None
+    recording = Recording([log])
+    its = recording.session(recording.choose())
+    changed = without(its.changes[-1], ["law.Gamma", "reference.kind"])
+    assert (changed.gains, changed.reference) == (None, None)
+    kept = without(its.changes[1], ["law.Gamma"])
+    assert kept.gains is not None
+    assert kept.gains.named == {"C2": (0.2, 0.2, 0.2)}
+    forked = fork([log], 0, overrides=["law.Gamma=[0.02,0.02,0.02]"])  # the operator's C2 acts as it did
+    assert forked.parts is not None
+    assert forked.parts.tick >= 400
+
+
+def test_accepted_differences_do_not_cover_later_ones(tmp_path: Path) -> None:
+    """Two rows of the controller, in the first batch and far behind it, that are not what it computes."""
+    make_log(log := tmp_path / "a.mcap", TICKS, settings=lockstep())
+
+    def other(*ticks: int) -> Path:
+        def edit(columns: dict[str, np.ndarray]) -> None:
+            frames = columns["command"].view(np.uint8).reshape(len(columns["tick"]), -1)
+            frames[np.isin(columns["tick"], ticks), -1] ^= 0x10
+
+        return rewrite(log, tmp_path / "b.mcap", edited("controller", edit))
+
+    first = check_log([other(7)], [])
+    assert (first.differ, first.same) == (1, False)
+    (accepted,) = check_logs([tmp_path / "b.mcap"], accept=True)
+    assert accepted.same
+    assert check_log([other(7)], []).same
+    for later in (300, 449):
+        both = check_log([other(7, later)], [])
+        assert (both.differ, both.first) == (2, first.first)
+        assert not both.same
+
+
+LATE = """
+    def expressions(self, now):
+        u, after = super().expressions(now)
+        is_first = now.state["sign"] == 0
+        return 0 * u + 24 * is_first - {volts} * (1 - is_first), after
+"""
+
+
+def test_other_commands_later_are_not_accepted_with_the_first(own: tuple[Path, Path]) -> None:
+    """Two changes that differ from the log at every tick, at the first by the same command."""
+    log, file = own
+    found = []
+    for volts in (24, 20):
+        rewrite_module(
+            file, OWN_LAW.replace("    Settings = Settings\n", "    Settings = Settings\n" + LATE.format(volts=volts))
+        )
+        found.append(check_logs([log], accept=volts == 24)[0])
+    accepted, other = found
+    assert accepted.same
+    assert (other.first, other.differ) == (accepted.first, accepted.differ)
+    assert not other.same
 
 
 def test_the_table_goes_into_a_pull_request(corpus: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

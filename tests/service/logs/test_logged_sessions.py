@@ -17,6 +17,7 @@ from aeroloop.protocol.messages.trace import (
     ControllerRow,
     End,
     Outcome,
+    PlantRow,
     Received,
     Sent,
     TraceWriter,
@@ -126,6 +127,25 @@ def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, t
     computed, left_out = replayed.controller.ticks, RECORD_S / known.settings.loop.period
     assert len(known.commands) - findings.missing_ticks["controller"] - left_out < computed < len(known.commands)
     assert f"{findings.missing_ticks['plant']} rows are missing" in replayed.reasons["plant"]
+
+
+@pytest.mark.parametrize("lacking", [0, 1, 2])
+def test_the_last_rows_that_the_other_end_proves_are_missing_to_the_row(lacking: int) -> None:
+    """The controller has received the measurements of so many ticks more than the plant's trace has."""
+    wire, index, session = WireSpec(), TraceIndex(), "s1"
+    frames = bytes(wire.measurement.size), bytes(wire.command.size)
+    controller, plant = (TraceWriter(end, wire, 7) for end in ("controller", "plant"))
+    controller.session = plant.session = session
+    for k in range(25):
+        controller.row(ControllerRow(k, Received.FRAME, Sent.FRAME, 10**10 + k, 10**10 + k, *frames))
+        if k < 25 - lacking:
+            volts = (0.0,) * wire.actuators
+            plant.row(PlantRow(k, k, Sent.FRAME, Sent.NONE, Outcome.NONE, 0, -1, 10**10 + k, 0, *frames, volts))
+    index.add(VEHICLE, controller.take(10**10, 1, final=True), 1)
+    index.add(VEHICLE, plant.take(10**10, 1, final=not lacking), 1)
+    index.finish()
+    proven = Missing(vehicle=VEHICLE, session=session, end="plant", first_tick=25 - lacking, last_tick=24, rows=lacking)
+    assert index.missing == ([proven] if lacking else [])
 
 
 @pytest.mark.parametrize(("end", "proven"), [("controller", 1), ("plant", 0)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -146,18 +145,20 @@ def test_a_copy_reads_as_the_clean_log(clean: Path, dirty: Path, tmp_path: Path)
     assert replay([tmp_path / "out.mcap"]).plant == replay([clean]).plant
 
 
-def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alone(
+def test_traces_of_another_vehicle_are_named_and_judged_only_if_it_is_asked_for(
     clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its sessions are named, and as they could not be compared, the exit code is 1."""
+    """No description describes it, so where it is asked for it cannot be compared."""
     ghost = [
         one._replace(key=one.key.replace("/aero/", "/ghost/")) for one in contents(clean)[0] if one.topic == "trace"
     ]
     path = rewrite(clean, tmp_path / "a.mcap", more=ghost)
     both, good = replay([path]), replay([clean])
     assert (both.controller, both.plant) == (good.controller, good.plant)
-    assert execute(["log", "replay", str(path), "--json"]) == 1
-    assert "ghost" in json.dumps(json.loads(capsys.readouterr().out)["reasons"])
+    assert execute(["log", "replay", str(path)]) == 0
+    assert f"not judged: ghost/{SESSION}, {2 * TICKS} rows" in capsys.readouterr().out
+    assert execute(["log", "replay", str(path), "--vehicle", "ghost"]) == 1
+    assert "no description of ghost's controller or plant" in capsys.readouterr().err
 
 
 FIELDS = {"sizes": (4, 4), "rows": (8, 4), "run": (16, 8), "first_row": (24, 8), "monotonic_ns": (32, 8)}

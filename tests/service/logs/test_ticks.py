@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,17 +12,18 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Telemetry
-from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import Outcome, PlantRow, Received, Sent, TraceWriter, read_batch
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.daemon.tick_source import PlantTick
 from aeroloop.service.logs.recording import Recording
 from aeroloop.service.logs.replay import EndReplay, replay
-from aeroloop.service.logs.ticks import Ticks, recompute
+from aeroloop.service.logs.ticks import Ticks, clock_offset, recompute
 from aeroloop.service.review.review import review
 from aeroloop.service.testing.hil_log import HilLog
 from tests.golden.make import HERE as GOLDEN
 from tests.support import own_laws
+from tests.support.edited_log import Said, rewrite
 from tests.support.ideal import IDEAL
 from tests.support.made_log import (
     AN_OPERATORS_WORDS,
@@ -101,6 +103,13 @@ def test_ticks_without_a_valid_measurement_are_left_out_of_every_column(tmp_path
     check_by_telemetry(found.ticks, log, lockstep())
 
 
+def test_the_offset_of_two_clocks_is_that_of_the_frames_that_did_not_queue() -> None:
+    """Both ways take 150 µs and the clocks differ by 5 s; every third command waits in a queue for up to 20 ms."""
+    waits_ns = np.where(np.arange(1024) % 3 == 0, np.random.default_rng(1).uniform(1e6, 2e7, 1024), 0.0)
+    offset = clock_offset(np.full(1024, 5e9 + 150e3), 150e3 - 5e9 + waits_ns)
+    assert offset == pytest.approx(5e9, abs=1.0)
+
+
 def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +132,39 @@ def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(
     assert len(its.k) == len(lost)
     for column in (its.attitude, its.desired, its.rate, its.attitude_error, its.rate_error):
         assert not np.isnan(column).any()
+
+
+def test_a_tick_that_was_not_computed_leaves_the_laws_state_as_it_was(tmp_path: Path) -> None:
+    lost = {50, 51, 52, 120}
+    make_log(tmp_path / "a.mcap", 200, settings=lockstep(), lost=lost)
+    ticks = recompute(Recording([tmp_path / "a.mcap"]).session((VEHICLE, SESSION))).ticks
+    assert ticks.k.tolist() == list(range(200))
+    for k in lost:
+        before = max(set(range(k)) - lost)
+        assert ticks.state_next[k].tolist() == ticks.state_next[before].tolist()
+        assert np.isnan(ticks.state[k]).all()
+    assert (ticks.state_next[53] != ticks.state_next[49]).any()
+
+
+def test_a_state_is_taken_from_the_log_only_after_missing_rows(tmp_path: Path) -> None:
+    """Every batch has the controller's state before it; one that nothing contradicts is what was computed."""
+    make_log(log := tmp_path / "a.mcap", 500, settings=lockstep())
+
+    def otherwise(one: Said) -> Said:
+        batch = read_batch(one.data) if one.key.endswith("trace/controller") else None
+        if batch is None or batch.tail.state is None or batch.header.first_row == 0:
+            return one
+        tail = one.data[len(one.data) - batch.header.tail_bytes :]
+        state = json.loads(tail)
+        state["state"]["law"]["damping_estimate"] = [0.5, 0.5, 0.5]
+        text = json.dumps(state).encode()
+        head = one.data[:12] + len(text).to_bytes(4, "little")
+        return one._replace(data=head + one.data[16 : len(one.data) - len(tail)] + text)
+
+    edited = rewrite(log, tmp_path / "b.mcap", otherwise)
+    assert replay([edited]).controller == EndReplay(ticks=500, differ=0)
+    its, whole = (recompute(Recording([path]).session((VEHICLE, SESSION))).ticks for path in (edited, log))
+    assert (its.state == whole.state).all()
 
 
 def test_the_sign_of_q_goes_on_where_only_the_plant_has_a_tick(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from aeroloop.service.report.drawings import drawings, page_data
-from aeroloop.service.report.page import page
+from aeroloop.service.report.page import largest_error, page
 from aeroloop.service.review.report import Check, Line, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report, made_theorem
 
@@ -62,6 +62,16 @@ def test_the_page_states_what_could_not_be_read_whether_lines_are_thinned_out_an
     assert "up to 64 ticks, 0.128 s" in page([made_report(thinned=64)])
     part = texts_of(replace(made_report(), part=(2.0, inf)))
     assert "Judged is the part from 2 s to 10 s alone; trips, events and what is missing are of the whole log." in part
+
+
+def test_the_largest_error_that_is_drawn_is_named_with_its_time() -> None:
+    made = made_report()
+    angles = np.full(len(made.time), 0.5)
+    angles[100:120] = 3.0
+    angles[110], angles[0] = 4.25, np.nan
+    error = Panel("error_angle", "Attitude error, as an angle", "angle", "°", [Line("measured", angles)])
+    assert largest_error(replace(made, panels=[*made.panels, error])) == (made.time[110], 4.25)
+    assert largest_error(made) is None
 
 
 def test_a_comparison_has_differences_to_the_first_run() -> None:

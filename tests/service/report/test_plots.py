@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.axes import Axes
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
@@ -62,6 +63,19 @@ def test_every_figure_has_the_papers_number_letters_and_units_and_faults_are_sha
     windy = load(overrides=["plant.wind.blowing=true"])
     (path,) = draw_figures(only(quantized, "error"), windy, tmp_path)
     assert path.stem == "C.12-error"  # the number is that of the case
+
+
+@pytest.mark.usefixtures("svg_only")
+def test_a_fault_is_shaded_from_its_begin_to_its_end_or_to_that_of_the_session(
+    quantized: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shaded: list[tuple[float, float]] = []
+    monkeypatch.setattr(Axes, "axvspan", lambda _, begin_s, end_s, **_style: shaded.append((begin_s, end_s)))
+    faults: list[tuple[str, float, float | None]] = [("gyro off", 0.1, None), ("motor off", 0.05, 0.2)]
+    draw_figures(with_faults(only(quantized, "error_angle"), *faults), load(), tmp_path)
+    assert shaded == []  # a group that no figure draws
+    draw_figures(with_faults(only(quantized, "input"), *faults), load(), tmp_path)
+    assert shaded == [(0.1, quantized.time[-1]), (0.05, 0.2)] * 2  # of two motors
 
 
 def test_a_figure_has_every_format_the_width_of_a_column_and_always_the_same_bytes(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Loss, Percentiles, Status
+from aeroloop.protocol.messages.operator import Hold
 from aeroloop.protocol.messages.trace import Outcome, Received, read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
@@ -74,6 +75,30 @@ def test_events_are_shown_once_at_their_sender_s_time_as_of_the_role_in_their_ke
     assert findings.trips == ["tilted"]
     (change,) = (mark.text for mark in findings.marks if mark.kind == "change")
     assert change.endswith("follows a sinusoid of roll, pitch, yaw 0°, 40°, 100° (by ann@lab, ann)")
+
+
+def test_what_happened_soon_after_the_session_has_no_time_in_it(whole: Path, tmp_path: Path) -> None:
+    """The tick after the last one is still the session's: what it ended with."""
+    said = [event(0.999, "recorder", "changed", "at the end", None), event(1.02, "recorder", "changed", "after", None)]
+    marks = found(rewrite(whole, tmp_path / "a.mcap", more=said)).marks
+    times = {mark.text: mark.time_s for mark in marks if mark.role == "recorder"}
+    assert times == {"at the end": pytest.approx(0.999, abs=1e-3), "after": None}
+
+
+@pytest.mark.parametrize(("tick", "at_s"), [(TICKS, 1.0), (TICKS + 1, 0.998)], ids=["the next", "a later"])
+def test_an_event_just_after_the_last_tick_keeps_its_tick(whole: Path, tmp_path: Path, tick: int, at_s: float) -> None:
+    """A plant trips before it measures: its tick is the one after the last. A later one is nobody's tick."""
+    said = event(0.9, "plant", "tripped", "late", tick=tick)
+    (mark,) = (one for one in found(rewrite(whole, tmp_path / "a.mcap", more=[said])).marks if one.text == "late")
+    assert mark.time_s == (at_s if tick == TICKS else pytest.approx(0.9, abs=2e-3))
+
+
+def test_a_gap_of_the_first_tick_alone_is_not_unseen_later(tmp_path: Path) -> None:
+    changes = {1: (None, Hold(attitude=(0.0, 0.0, 0.0)))}
+    make_log(path := tmp_path / "a.mcap", 1200, settings=load(), lost={0}, changes=changes)
+    assert [(one.first_tick, one.last_tick) for one in found(path).unknown] == [(0, 0)]
+    assert len(found(path).unseen["missing_ticks"]) == 1
+    assert read(path, since_s=0.5).findings.unseen["missing_ticks"] == []
 
 
 def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:

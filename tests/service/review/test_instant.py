@@ -104,6 +104,8 @@ def test_silence_repeats_the_last_frame_and_what_is_missing_is_said(tmp_path: Pa
     nothing = "no command that answers this measurement acted"
     assert lossy.at(100).notes == [nothing, "the log lacks the controller's row"]
     assert lossy.at(100).command.sent_as == "missing"
+    assert lossy.at(100).state_after == {}  # the law did nothing
+    assert lossy.at(101).state_after["damping_estimate"] != lossy.at(99).state_after["damping_estimate"]
     assert lossy.at(0.202).values["latency_us"] == pytest.approx(300, abs=1)
     sent, received = (lossy.at(101).clocks_s[name] for name in ("plant sent the measurement", "plant received it"))
     assert sent is not None

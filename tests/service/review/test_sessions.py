@@ -81,7 +81,10 @@ def test_a_session_is_judged_by_the_configuration_that_it_began_with(log: Path, 
         messages = made(settings, 200 if number == "1" else 100)
         assert found.figures.z_track == review(write(tmp_path / "a.mcap", settings, messages)).z_track
     replayed = replay([log])
-    assert [(one.session, one.differ) for one in replayed.sessions] == [("s1", 0), ("b1", 0), ("s2", 0)]
+    assert [(one.session, one.differ) for one in replayed.sessions] == [("s1", 0), ("s2", 0)]
+    assert replayed.others == [f"{OTHER}/b1, 300 rows"]
+    other = replay([log], vehicle=OTHER)
+    assert [(one.session, one.differ) for one in other.sessions] == [("b1", 0)]
 
 
 def test_trips_are_of_the_vehicle_and_of_a_named_session_alone_and_the_account_lists_all_of_both(

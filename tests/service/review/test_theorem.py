@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Sinusoid, Stream
 from aeroloop.service.config import Settings, load
 from aeroloop.service.review import theorem as check
@@ -22,7 +23,7 @@ from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.invariant import Reach, reach
 from aeroloop.service.theorem.premises import Premises
 from tests.support.certified import FREE, bits
-from tests.support.edited_log import at_rest, message_of, rewrite
+from tests.support.edited_log import Said, at_rest, message_of, rewrite
 from tests.support.ideal import IDEAL
 from tests.support.made_log import SESSION, START_NS, description, lockstep, make_log
 
@@ -96,6 +97,34 @@ def test_a_lost_frame_ends_what_was_proven_before_it(tmp_path: Path, mode: str, 
         _, theorem = judged(path)
         assert (theorem.samples, theorem.held) == (300, True)
         assert theorem.pointwise_judged == 300 - (2 + late) * (1 + len(lost))
+
+
+def test_a_tick_that_the_plant_skipped_ends_what_was_proven_before_it(tmp_path: Path) -> None:
+    """In lockstep, where each command acts at once: the state after the gap starts anew, and proves the next."""
+    for name, skipped in (("whole", []), ("skipped", [205])):
+        path = tmp_path / f"{name}.mcap"
+        make_log(path, 300, settings=settled("loop.lockstep=true"), truth_every=1, skipped=skipped)
+        _, theorem = judged(path)
+        assert (theorem.samples, theorem.held) == (300 - len(skipped), True)
+        assert theorem.pointwise_judged == theorem.samples - 2 - 2 * len(skipped)
+
+
+@pytest.mark.parametrize(("mode", "tick", "fewer"), [("true", 0, 0), ("true", 1, 1), ("false", 0, 0), ("false", 1, 1)])
+def test_in_real_time_two_states_in_a_row_must_be_near_enough(tmp_path: Path, mode: str, tick: int, fewer: int) -> None:
+    """A command that acts in real time was computed from the state before.
+
+    A state proves the next from tick 1 on in lockstep, in real time from tick 2 on, whose state before is of tick 1.
+    """
+
+    def far(one: Said) -> Said:
+        if one.topic != "truth" or (truth := Truth.decode(one.data)).session_tick != tick:
+            return one
+        return one._replace(data=truth.model_copy(update={"rate": (9.0, 9.0, 9.0)}).encode())
+
+    make_log(log := tmp_path / "a.mcap", 300, settings=settled(f"loop.lockstep={mode}"), truth_every=1)
+    _, near = judged(log)
+    _, theorem = judged(rewrite(log, tmp_path / "b.mcap", far))
+    assert theorem.pointwise_judged == near.pointwise_judged - fewer
 
 
 def test_with_faults_at_the_plant_nothing_is_judged(tmp_path: Path) -> None:
