@@ -29,7 +29,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject, Mark, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
+from aeroloop.protocol.messages.trace import Outcome, record_json
 from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import LatencyHistogram, RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
@@ -100,7 +100,7 @@ class ZenohNetwork(PlantNetwork):
 
     def serve(self) -> None:
         role = self._role
-        role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
+        role.declare("trace", lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
         role.serve("record", SessionRecord, self._keep_record)

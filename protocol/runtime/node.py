@@ -38,7 +38,6 @@ ASKER_LENGTH: Final = 100  # most characters of an operator's name
 ASKED_BY: Final = ContextVar("asked by", default="")
 """The operator that asked for what is done now, as a name for people to read, which nothing authenticates."""
 _RECENT_S: Final = 10.0
-_SELDOM_PER_S: Final = 8.0  # cached messages of a topic that was not declared beforehand: statuses, events
 _GRAVE: Final = ("tripped", "lost", "fault", "refused")
 
 log: Final = logging.getLogger("aeroloop")
@@ -220,10 +219,10 @@ class Node:
 
     # ── publications ──
 
-    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+    def declare(self, topic: str, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
         key, json = topics.key(topic, self.vehicle, role=self.role), topics.TOPICS[topic].kind == "json"
-        self._publishers[topic] = CachedPublisher(self.zenoh, key, per_s, lossless=lossless, json=json)
+        self._publishers[topic] = CachedPublisher(self.zenoh, key, lossless=lossless, json=json)
 
     def publish(self, topic: str, message: Message) -> None:
         """Publish a message on one of the table's JSON topics."""
@@ -236,7 +235,7 @@ class Node:
             self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
             return
         if topic not in self._publishers:
-            self.declare(topic, _SELDOM_PER_S)
+            self.declare(topic)
         self._publishers[topic].put(payload)
 
     def publish_description(

@@ -12,14 +12,13 @@ from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Request, in_words
 from aeroloop.protocol.messages.states import ControllerState as State
 from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
-from aeroloop.protocol.messages.trace import batches_per_s
 from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
 from aeroloop.service.daemon.claim import SessionLostError
-from aeroloop.service.daemon.session import TELEMETRY_HZ, Session, Shared
+from aeroloop.service.daemon.session import Session, Shared
 
 STATUS_PERIOD_S: Final = 1.0
 CLAIM_PERIOD_S: Final = 0.25
@@ -44,8 +43,8 @@ class Daemon:
         role, loop, machine, own = self._role, self._settings.loop, self._shared.machine, self._settings.controller
         if not loop.lockstep:
             self._notes = prepare_process(loop)
-        role.declare("telemetry", TELEMETRY_HZ)
-        role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
+        role.declare("telemetry")
+        role.declare("trace", lossless=loop.lockstep)
         self._shared.changes.serve()
         role.serve("stand_down", Request, lambda _: self._stand_down)
         role.serve("recall", Request, lambda _: self._recall)

@@ -59,7 +59,7 @@ class Stage:
         settings = load(overrides=["loop.rate_hz=500", *overrides])
         self.shared = Shared(self.role, settings, lambda: "")
         self.shared.claims.session = SESSION
-        self.role.declare("trace", 10)
+        self.role.declare("trace")
         controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         link = cast(ZenohLink, self.link)
         cast(Any, link).refused = 0

@@ -11,6 +11,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -127,11 +128,11 @@ def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch
 
 
 class Publisher:
-    """Publishes messages from a cache of 65 000."""
+    """Publishes messages, and keeps those of the last minute."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.count = 0
-        self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
+        self._publisher = CachedPublisher(session, KEY, lossless=True)
 
     def send(self, until: int, size: int = 1) -> None:
         for _ in range(self.count, until):
@@ -169,7 +170,7 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
 
     def publish(key: str, payload: bytes) -> None:
         if key not in publishers:
-            publishers[key] = CachedPublisher(session, key, per_s=50)
+            publishers[key] = CachedPublisher(session, key)
         publishers[key].put(payload)
         published.setdefault(key, []).append(payload)
 
@@ -207,7 +208,7 @@ def test_the_last_message_in_a_log_is_that_recording_stopped_and_traces_that_can
     """It cannot know whether their publishers have ended or its cable is out."""
     monkeypatch.setattr(history, "ANSWER_S", 0.1)
     session = gathering.join()
-    published, running = CachedPublisher(session, TRACE, per_s=10), record()
+    published, running = CachedPublisher(session, TRACE), record()
     published.put(b"")
     running.await_written()
     session.close()
@@ -230,7 +231,7 @@ def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and
 ) -> None:
     running, session = record(), gathering.join()
     names = [topics.key(name, "aero", role="plant") for name in topics.RECORDED if name != "description"]
-    publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
+    publishers = [CachedPublisher(session, key) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
     settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
@@ -250,7 +251,9 @@ def test_a_full_disk_is_reported_and_what_its_cache_holds_no_longer_is_counted_i
 ) -> None:
     """Every message is in the log or in the count of those that are not; none is in both, and none is lost twice."""
     monkeypatch.setattr(history, "WAITING_BYTES", 50 * 201)
-    short = CachedPublisher(gathering.join(), KEY.replace("aero/", "beta/"), per_s=1, lossless=True)  # of 65 messages
+    monkeypatch.setattr(history, "LEAST_KEPT", 65)
+    hours = count(step=2 * history.KEPT_S)  # each message is too old to be kept once the next is published
+    short = CachedPublisher(gathering.join(), KEY.replace("aero/", "beta/"), lossless=True, clock=lambda: next(hours))
     running, reported = record(), list[Status]()
     gathering.join().declare_subscriber(
         OWN_STATUS, lambda sample: reported.append(Status.model_validate_json(sample.payload.to_bytes()))
