@@ -153,11 +153,8 @@ class ZenohNetwork(PlantNetwork):
     def follow_session(self) -> None:
         endpoint = self._endpoint
         self._trace.follow(endpoint)
-        if endpoint.session is None and self._link is not None:
-            self._link.close()
-            self._refused += self._link.refused
-            self._link = None
-            self._forget_holder()
+        if endpoint.session is None:
+            self._close_link()
         if endpoint.notices:
             self._keep_latch()
             for notice in endpoint.notices:
@@ -218,12 +215,13 @@ class ZenohNetwork(PlantNetwork):
             text = f"{claim.controller} refused: {answer.reason}"
             role.warn(text, "refused", text, claim.session)
             return answer
+        self._close_link()  # of a session that ended in the same batch of requests
         self._sent_at = [(-1, 0)] * self._counters
         self._link = ZenohLink(  # before the grant is sent, so that the first command is not lost
             role.zenoh,
             send_key=topics.key("measurement", role.vehicle, session=claim.session),
             receive_key=topics.key("command", role.vehicle, session=claim.session),
-            lengths=self._endpoint.wire.lengths("command", lockstep=self._loop.lockstep),
+            accepts=self._endpoint.wire.acceptance("command", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
             changed=self._changed,
             also=self._role.datagrams.session,
@@ -235,6 +233,14 @@ class ZenohNetwork(PlantNetwork):
 
         self._forget_holder = role.watch_token(claim.controller, seen)
         return answer
+
+    def _close_link(self) -> None:
+        """Close the link of the session that has ended, if there is one."""
+        if self._link is not None:
+            self._link.close()
+            self._refused += self._link.refused
+            self._link = None
+            self._forget_holder()
 
     def _release(self, release: Release) -> Answer:
         done = self._endpoint.release(release.session)
