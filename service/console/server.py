@@ -90,13 +90,17 @@ class Console:
         self.url = f"{self.origin}/?token={self._token}"
 
     def run(self, stop: Event) -> None:
-        """Serve until `stop` is set."""
+        """Serve until `stop` is set, or an exception ends it: a Python process with an open session would not end."""
         Thread(target=self._server.serve_forever, daemon=True).start()
-        while not stop.wait(BLOCK_S):
-            for one in self._descriptions.take():
-                self._feed.take(one.key, one.payload, time.monotonic(), one.published_ns * 1e-9)
-        self._server.shutdown()
-        self._session.__exit__(None, None, None)
+        try:
+            while not stop.wait(BLOCK_S):
+                for one in self._descriptions.take():
+                    self._feed.take(one.key, one.payload, time.monotonic(), one.published_ns * 1e-9)
+        finally:
+            try:
+                self._server.shutdown()
+            finally:
+                self._session.__exit__(None, None, None)
 
     def _receive(self, sample: zenoh.Sample) -> None:
         self._feed.take(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic(), time.time())

@@ -16,18 +16,19 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport import history
-from aeroloop.protocol.transport.history import CachedPublisher, attachment
+from aeroloop.protocol.transport.history import CachedPublisher, Delivery, RecoveringSubscriber, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.recorder import Recorder
-from aeroloop.service.recording.rolling import RecorderError, parts
+from aeroloop.service.recording.rolling import parts
 from aeroloop.service.settings import RecorderSettings
 from tests.support.edited_log import by_mcap, contents
 from tests.support.made_log import description, made
@@ -43,7 +44,7 @@ class Running:
 
     def __init__(self, path: Path, network: NetworkSettings) -> None:
         self.path, self.full = path, False
-        self.error: RecorderError | None = None
+        self.error: Exception | None = None
         self.role = Node("recorder", "aero", network, {})
         self.recorder = Recorder(self.role, RecorderSettings(path=path))
         self._write = os.pwrite
@@ -53,7 +54,7 @@ class Running:
     def _run(self) -> None:
         try:
             self.recorder.run()
-        except RecorderError as error:
+        except Exception as error:
             self.error = error
 
     def write(self, fd: int, data: memoryview, offset: int) -> int:
@@ -241,6 +242,25 @@ def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and
     running.end()
     assert {key for key, _, data in running.messages() if data == b"\xff\x00"} == {*names, DESCRIPTION}
     assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
+
+
+def test_a_recorder_that_fails_closes_its_log_with_an_index(
+    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: RecoveringSubscriber) -> list[Delivery]:
+        raise RuntimeError("a defect")
+
+    running = record()
+    publisher.send(1)
+    running.await_written()
+    monkeypatch.setattr(RecoveringSubscriber, "take", fail)
+    eventually("the failure", lambda: running.error is not None)
+    assert str(running.error) == "a defect"
+    with running.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count >= 3
 
 
 # ── what is lost ──
