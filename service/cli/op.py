@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, show
+from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, say, show
 from aeroloop.service.cli.entry import run_alone
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def stop(
 
     answers, failures = stop_plants(target.network, None if every else vehicle)
     for line in answers:
-        typer.echo(line)
+        say(line)
     if failures:
         fail("; ".join(failures), 1)
 
@@ -274,4 +274,4 @@ def _send(config: Path | None, overrides: Sequence[str] | None, topic: str, mess
     from aeroloop.service.host.operator import only_vehicle, send
 
     vehicle = vehicle or only_vehicle(target.network) or target.vehicle
-    typer.echo(send(target.network, vehicle, topic, message or Request()))
+    say(send(target.network, vehicle, topic, message or Request()))
