@@ -248,7 +248,7 @@ class Node:
             vehicle=self.vehicle,
             host=socket.gethostname(),
             versions=versions() | (law or {}),
-            facts=host_facts(),
+            facts=host_facts() | {"process": self.process},
             config=config,
             certificate=certificate,
         ).encode()

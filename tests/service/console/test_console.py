@@ -72,6 +72,7 @@ def test_a_page_shows_the_loop_and_a_click_on_stop_brings_0_v_within_a_period(hi
         page.wait_for_function(f"() => {newest} > {first[0] + 1}")
         assert page.evaluate("scene.toDataURL()") != first[1]
         assert page.inner_text("#state") == "driven"
+        page.wait_for_selector(".stage:not(.old) th:has-text('now')")
         page.fill("[name=yaw]", "20")
         page.wait_for_function("() => /shortest [0-9.]+ s/.test(document.querySelector('#preview').textContent)")
         page.click("form[data-verb=goto] button")
@@ -86,6 +87,9 @@ def test_a_page_shows_the_loop_and_a_click_on_stop_brings_0_v_within_a_period(hi
         page.click(".bar .stop")
         page.wait_for_selector("#answers li.good:has-text('stop: aero is at 0 V')")
         page.wait_for_selector("#state:has-text('tripped')")
+        page.wait_for_selector(".stage.old th:has-text('last known, ')")  # no attitude is measured now
+        hil.kill("plant")
+        page.wait_for_selector("#state:has-text('silent for ')")
         assert complaints == []
     assert any("stopped by an operator" in trip for trip in hil.log.trips)
     (tripped,) = (event for event in hil.log.events if event.kind == "tripped")

@@ -8,7 +8,7 @@ import pytest
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.service.config import load
-from aeroloop.service.console.feed import Feed, panels_of
+from aeroloop.service.console.feed import Feed, Vehicle, panels_of
 from aeroloop.service.logs.session import Array
 from aeroloop.service.logs.ticks import euler_deg
 from aeroloop.service.review.review import read
@@ -88,6 +88,60 @@ def test_of_several_controllers_the_one_with_the_session_is_shown() -> None:
     for now_s, status, shown in ((0.0, spare, "spare"), (0.1, own, "own"), (1.0, spare, "own"), (4.2, spare, "spare")):
         feed.take(key, status.encode(), now_s, 0.0)
         assert feed.gathered(now_s).statuses[VEHICLE]["controller"].process == shown
+
+
+def test_a_controller_that_is_refused_changes_nothing_of_what_is_shown() -> None:
+    """Its wire has other levels of the same bits: decoded with those, a pitch of 23.5° was shown as 11.6°."""
+    settings, other = load(), load(overrides=["wire.attitude.limit=0.5", "law.C1=[1,1,1]"])
+    feed, vehicle = Feed(), Vehicle(VEHICLE)
+    feed.vehicles[VEHICLE] = vehicle
+    keys = {role: topics.key("description", VEHICLE, role=role) for role in ("plant", "controller")}
+    own = Status(
+        role="controller", state="running", process="own", session="s1", uptime_s=1, ticks=0, rate_hz=0, skipped=0
+    )
+    refused = own.model_copy(update={"state": "searching", "process": "refused", "session": None})
+    described = {
+        "own": description(settings, "controller", process="own"),
+        "refused": description(other, "controller", process="refused"),
+    }
+    feed.take(keys["controller"], described["refused"].encode(), 0.0, 0.0)  # no plant and no status is known yet
+    assert vehicle.settings == other
+    feed.take(keys["plant"], description(settings, "plant", process="plant").encode(), 0.0, 0.0)
+    feed.take(keys["controller"], described["own"].encode(), 0.0, 0.0)
+    feed.take(topics.key("status", VEHICLE, role="controller"), own.encode(), 0.0, 0.0)
+    assert vehicle.settings == settings
+    messages = [message for message in made(settings, 200) if "/trace/plant" in message.key]
+    for message in messages:
+        feed.take(message.key, message.payload, 0.0, 0.0)
+    generation, rows = vehicle.generation, feed.block(VEHICLE, 0, 0, "")["rows"]
+    feed.take(keys["controller"], described["refused"].encode(), 0.1, 0.0)
+    feed.take(topics.key("status", VEHICLE, role="controller"), refused.encode(), 0.1, 0.0)
+    assert (vehicle.generation, vehicle.settings) == (generation, settings)
+    assert str(feed.block(VEHICLE, 0, 0, "")["rows"]) == str(rows) != "[]"
+    for number in range(100):
+        stranger = description(other, "controller", process=f"stranger {number}")
+        feed.take(keys["controller"], stranger.encode(), 0.2, 0.0)
+    assert (vehicle.generation, vehicle.settings) == (generation, settings)
+
+
+def test_frames_are_read_as_the_plant_describes_them() -> None:
+    """Whatever a controller says before its status tells whether it has the session."""
+    settings, other = load(), load(overrides=["wire.attitude.limit=0.5"])
+    messages = [message for message in made(settings, 200) if "/trace/plant" in message.key]
+    rows = []
+    for controller in (settings, other):
+        feed = Feed()
+        for role, each in (("plant", settings), ("controller", controller)):
+            feed.take(topics.key("description", VEHICLE, role=role), description(each, role).encode(), 0.0, 0.0)
+        for message in messages:
+            feed.take(message.key, message.payload, 0.0, 0.0)
+        rows.append(feed.block(VEHICLE, 0, 0, "")["rows"])
+    assert str(rows[0]) == str(rows[1]) != "[]"
+
+
+def test_the_law_s_state_is_drawn_as_in_a_log() -> None:
+    drawn = {panel.label: panel.unit for panel in panels_of(load(), None) if panel.group == "damping_estimate"}
+    assert drawn == {"θ̂₁": "N·m·s/rad", "θ̂₂": "N·m·s/rad", "θ̂₃": "N·m·s/rad"}
 
 
 def test_a_law_that_is_not_installed_here_costs_its_state_alone() -> None:
