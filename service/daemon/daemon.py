@@ -139,7 +139,7 @@ class Daemon:
         self._role.status(Status(
             role=self._role.role, state=state, session=shared.claims.session,
             cause=shared.cause if state is State.FAULTED else None, uptime_s=self._role.uptime_s,
-            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
+            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / max(now - self._status_time_s, 1e-3),
             skipped=counts.skipped, received=counts.received, sent=counts.sent, refused=refused, stale=counts.stale,
             saturated=counts.saturated + (session.controller.saturated if session else 0),
             age_us=shared.age.recent(), timing=shared.timing.report() if shared.timing else None,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import accumulate
-from math import acos, degrees, hypot
+from math import acos, cos, degrees, hypot, radians, sin
 from typing import Any, Final
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.models import SessionRecord
+from aeroloop.protocol.messages.models import Grant, SessionRecord
 from aeroloop.protocol.messages.operator import (
     Change,
     Gains,
@@ -25,10 +25,12 @@ from aeroloop.protocol.messages.operator import (
     Track,
 )
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.attitude import IDENTITY, distance
+from aeroloop.service.control.reference import Limits
 from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
 from tests.support.operated_loop import CONFIGURED, LEVEL, PERIOD, SWING, WIRE, Loop, gains_with, measured, turned
-from tests.support.plant_end import GAINS, record_of
+from tests.support.plant_end import GAINS, claim_of, claimed, record_of
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
 LATER_TOO_FAST = Points(
@@ -438,6 +440,45 @@ def test_points_go_on_with_the_first_that_was_not_reached(
         assert isinstance(left, Points)
         assert left.attitudes == points.attitudes[ahead[0] :]
         assert left.times == pytest.approx([times[i] - times[ahead[0]] for i in ahead])
+
+
+def test_a_body_found_beyond_the_limit_of_tilt_is_brought_back_whatever_the_tilt_on_the_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An operator's reference may tilt by 60°. From a roll of 170° and a pitch of 80° the way back tilts even more."""
+    monkeypatch.setattr(Limits, "of", lambda *_: Limits(rate=1.0, tilt=radians(60.0), rolls=True))
+    loop = of("configured", LEVEL)
+    loop.begin()
+    roll, pitch = radians(170.0) / 2, radians(80.0) / 2
+    found = [sin(roll) * cos(pitch), cos(roll) * sin(pitch), -sin(roll) * sin(pitch)]
+    for _ in range(5_000):
+        loop.tick([*found, 0.0, 0.0, 0.0])
+    (text,) = loop.events("changed")
+    assert "away from its reference: approaches" in text
+    assert distance(loop.controller.desired, IDENTITY) < 1e-6
+    loop.assert_it_runs_again()
+
+
+@pytest.mark.parametrize(
+    ("stopped", "ended", "source"), [(False, "released", "resumed"), (True, TripCause.OPERATOR, "held")]
+)
+def test_a_session_that_was_released_is_resumed_unless_an_operator_stopped_the_plant_since(
+    stopped: bool, ended: str, source: str
+) -> None:
+    """By the plant's own record; the next claim is granted after an `op arm`."""
+    endpoint, _ = claimed()
+    assert endpoint.keep(record_of("a", reference=TARGET))
+    endpoint.release("of-a")
+    if stopped:
+        endpoint.stop()
+        endpoint.arm()
+    grant = endpoint.claim(claim_of("b"))
+    assert isinstance(grant, Grant)
+    assert grant.last is not None
+    assert grant.last.ended == ended
+    loop = of("resume")
+    loop.begin(grant.last)
+    assert loop.live.record.reference_from == source
 
 
 def test_configured_follows_the_configuration_at_first_and_then_what_the_last_session_followed() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from math import isnan
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import MagicMock, patch
 
 import pytest
 
@@ -14,7 +15,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Grant, Refusal, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.messages.states import ControllerState, ControllerTrigger
-from aeroloop.protocol.messages.trace import Sent, read_batch
+from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
 from aeroloop.protocol.runtime import node
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
@@ -25,6 +26,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import Floats
 from aeroloop.service.daemon import claim
 from aeroloop.service.daemon.claim import ClaimClient
+from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.daemon.session import Session, Shared
 from tests.support.failing_laws import FAILING, Failing
 from tests.support.operated_loop import LonelyNode, Network
@@ -35,6 +37,7 @@ DELAY_NS = 200_000
 SESSION = "s1"
 WIRE = load().wire
 AT_REST = [0] * 6
+MOVING = [0, 0, 0, 20, -20, 20]
 INVALID = [WIRE.attitude.quantizer().invalid] * 6
 
 
@@ -43,6 +46,9 @@ def arrival(k: int, codes: Iterable[float] = AT_REST) -> Arrival:
 
 
 class Plant(Network):
+    def liveliness(self) -> MagicMock:
+        return MagicMock()
+
     def get(self, *_: object, **__: object) -> list[object]:
         return []
 
@@ -53,18 +59,21 @@ class Stage:
     def __init__(self, arrivals: Iterable[Arrival], *overrides: str) -> None:
         self.link = SimulatedLink([*arrivals], 1)
         self.network = Plant()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(node, "join", lambda *_: self.network)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(node, "join", lambda *_: self.network)
             self.role = LonelyNode("controller", "aero", NetworkSettings(), {}, name="c", clock=self.link)
-        settings = load(overrides=["loop.rate_hz=500", *overrides])
+        self.settings = settings = load(overrides=["loop.rate_hz=500", *overrides])
         self.shared = Shared(self.role, settings, lambda: "")
         self.shared.claims.session = SESSION
         self.role.declare("trace")
-        controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
-        link = cast(ZenohLink, self.link)
+        link = self.session_link = cast(ZenohLink, self.link)
         cast(Any, link).refused = 0
         self.published = 0
-        self.session = Session(self.role, settings, self.shared, controller, link, self._publish)
+        self.session = Session(self.role, settings, self.shared, self.fresh(), link, self._publish)
+
+    def fresh(self) -> Controller:
+        settings = self.settings
+        return Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
 
     def _publish(self) -> None:
         self.published += 1
@@ -80,10 +89,13 @@ class Stage:
         return [[WIRE.voltage.quantizer().level(code) for code in codes] for _, codes in filter(None, read)]
 
     @property
-    def rows(self) -> list[tuple[int, int]]:
+    def batches(self) -> list[Batch]:
         key = topics.key("trace", "aero", role="controller")
-        batches = filter(None, (read_batch(payload) for at, payload in self.network.put if at == key))
-        columns = [(batch.columns["tick"].tolist(), batch.columns["sent_as"].tolist()) for batch in batches]
+        return [*filter(None, (read_batch(payload) for at, payload in self.network.put if at == key))]
+
+    @property
+    def rows(self) -> list[tuple[int, int]]:
+        columns = [(batch.columns["tick"].tolist(), batch.columns["sent_as"].tolist()) for batch in self.batches]
         return [row for tick, sent_as in columns for row in zip(tick, sent_as, strict=True)]
 
     def status_of_plant(self, session: str, cause: str | None = None) -> None:
@@ -121,6 +133,67 @@ def test_a_session_that_the_plant_ends_is_lost_with_the_plants_reason() -> None:
     assert not stage.run()
     assert stage.shared.machine.state is ControllerState.SEARCHING
     assert stage.shared.cause == "the plant ended the session: stopped by an operator"
+
+
+def test_a_status_of_the_session_before_ends_no_new_one() -> None:
+    """The newest status is older than the claim, and the first measurement is late."""
+    stage = Stage(
+        [arrival(k)._replace(at_ns=50_000_000 + k * PERIOD_NS) for k in range(20)], "controller.duration_s=0.02"
+    )
+    stage.status_of_plant("s0", "released")
+    assert stage.run()
+    assert len(stage.commands) == 10
+
+
+def test_each_batch_has_the_state_before_its_first_row() -> None:
+    """From which a replay may begin, so a log that lacks some batches can still be computed again."""
+    stage = Stage([arrival(k, MOVING) for k in range(300)], "controller.duration_s=0.5")
+    assert stage.run()
+    batches = [batch for batch in stage.batches if batch.header.rows]
+    assert len(batches) >= 4
+    again = stage.fresh()
+    for batch in batches:
+        assert batch.tail.state == again.state.model_dump(mode="json")
+        changes = [*batch.tail.changes]
+        for k in batch.columns["tick"].tolist():
+            while changes and changes[0].tick <= k:
+                again.apply(changes.pop(0))
+            again.tick(arrival(k, MOVING).frame, k)
+
+
+@pytest.mark.parametrize("by_datagrams", [True, False])
+def test_the_link_of_datagrams_is_closed_with_the_session_that_used_it(by_datagrams: bool) -> None:
+    """The next claim connects anew: the plant may be another one."""
+    stage = Stage(map(arrival, range(10)))
+    stage.shared.claims.by_datagrams = by_datagrams
+    with patch.object(stage.role, "datagrams") as datagrams:
+        stage.run()
+        assert datagrams.close.called == by_datagrams
+
+
+def test_each_session_begins_with_a_law_that_has_learned_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A session is lost while the estimates move, and the vehicle is claimed again."""
+    first = [arrival(k, MOVING) for k in range(150)]
+    second = [arrival(k, MOVING)._replace(at_ns=450_000_000 + k * PERIOD_NS) for k in range(150)]
+    stage = Stage([*first, *second], "loop.realtime=off")
+    granted: list[str] = []
+
+    def claim(client: ClaimClient) -> ZenohLink | None:
+        stage.link.advance(0.001)
+        if len(granted) == 2:
+            stage.role.stop.set()
+            return None
+        granted.append(f"s{len(granted)}")
+        client.session = granted[-1]
+        return stage.session_link
+
+    monkeypatch.setattr(ClaimClient, "claim", claim)
+    Daemon(stage.role, stage.settings).run()
+    assert granted == ["s0", "s1"]
+    initial = stage.fresh().state.model_dump(mode="json")
+    for session in granted:
+        states = [batch.tail.state for batch in stage.batches if batch.header.session == session and batch.header.rows]
+        assert states[0] == initial != states[-1]
 
 
 def test_a_measurement_without_a_valid_value_is_answered_by_none_until_there_is_one() -> None:

@@ -232,6 +232,20 @@ def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_read(tmp
     )
 
 
+def test_a_disk_that_is_full_in_the_midst_of_a_chunk_leaves_no_torn_one(tmp_path: Path, disk: Disk) -> None:
+    """What the disk had taken of it is taken back at once: a crash then would leave a file that ends in it."""
+    run, path = Run(tmp_path / "a.mcap"), tmp_path / "a.mcap"
+    run.take(250)
+    whole, kept = path.stat().st_size, numbers(path)
+    disk.room = whole + 100
+    run.take(100)
+    assert run.log.trouble
+    assert path.stat().st_size == whole
+    assert numbers(path) == kept
+    disk.room = EVERYTHING
+    run.log.close()
+
+
 # ── files of a run ──
 
 
