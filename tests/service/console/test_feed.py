@@ -7,6 +7,7 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
+from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.service.config import load
 from aeroloop.service.console.feed import Feed, Vehicle, panels_of
 from aeroloop.service.logs.session import Array
@@ -69,6 +70,27 @@ def test_a_page_gets_what_it_lacks_once_and_of_a_new_session_all(
     feed.take(topics.key("event", VEHICLE, role="plant"), b"nonsense", 1.0, 1000.0)  # anyone may publish it
     feed.take(topics.key("trace", VEHICLE, role="plant"), b"nonsense", 1.0, 1000.0)
     assert feed.block(VEHICLE, 0, whole["numbered"] + 1, "s1")["events"] == []
+
+
+def test_nothing_of_the_session_before_is_in_the_rows_of_the_next() -> None:
+    """Its first command answers tick 5, which was measured in the session before; what was desired then is not now."""
+    settings, feed = load(), Feed()
+    feed.take(topics.key("description", VEHICLE, role="plant"), description(settings, "plant").encode(), 0.0, 0.0)
+    for message in made(settings, 200):
+        feed.take(message.key, message.payload, 0.0, 0.0)
+    writer = TraceWriter("plant", settings.wire, 2)
+    writer.session = "s2"
+    command = bytes(settings.wire.command.size)
+    acted = int(Outcome.ACTED)
+    row = PlantRow(1000, 200, Sent.NONE, Sent.FRAME, acted, 0, 5, 10**12, 10**12, b"", command, (1.0, 2.0))
+    writer.row(row)
+    feed.take(topics.key("trace", VEHICLE, role="plant"), writer.take(10**12, 0), 0.0, 0.0)
+    columns = feed.vehicles[VEHICLE].columns
+    (shown,) = feed.block(VEHICLE, 0, 0, "")["rows"]
+    values = dict(zip(columns, shown[1:], strict=True))
+    assert values["input", "u₂", "commanded"] == 1.0
+    assert np.isnan(values["latency", "latency", "latency"])
+    assert np.isnan(values["angles", "yaw", "desired"])
 
 
 def test_a_bound_is_drawn_only_where_it_is_proven() -> None:

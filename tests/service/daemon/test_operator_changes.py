@@ -98,6 +98,7 @@ def test_what_is_refused_is_answered_with_the_reason_and_changes_nothing(
 
 def test_without_a_session_there_is_nothing_to_change(loop: Loop) -> None:
     loop.end()
+    assert loop.live.record.session is None
     before = list(loop.network.put)
     asked = loop.ask("track", Track(reference=yaw_of(30.0)))
     loop.role.take_inbox()

@@ -12,7 +12,7 @@ import pytest
 
 from aeroloop import Now
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Grant, Refusal, SessionRecord, Status
+from aeroloop.protocol.messages.models import Event, Grant, Refusal, SessionRecord, Status, Telemetry
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.messages.states import ControllerState, ControllerTrigger
 from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
@@ -203,6 +203,25 @@ def test_a_measurement_without_a_valid_value_is_answered_by_none_until_there_is_
     assert stage.shared.machine.state is ControllerState.RUNNING
 
 
+def test_without_any_valid_value_from_the_start_the_controller_is_ready_and_says_so_once() -> None:
+    stage = Stage([arrival(k, INVALID) for k in range(20)], "controller.duration_s=0.04")
+    assert stage.run()
+    assert stage.shared.machine.state is ControllerState.READY
+    key = topics.key("event", "aero", role="controller")
+    events = [Event.model_validate_json(payload) for at, payload in stage.network.put if at == key]
+    assert [event.text for event in events if event.kind == "fault"] == [
+        "no valid measurement: commands no valid value"
+    ]
+
+
+def test_telemetry_is_published_ten_times_a_second() -> None:
+    stage = Stage(map(arrival, range(200)), "controller.duration_s=0.4")
+    assert stage.run()
+    key = topics.key("telemetry", "aero", role="controller")
+    published = [Telemetry.model_validate_json(payload) for at, payload in stage.network.put if at == key]
+    assert [telemetry.tick for telemetry in published] == [0, 50, 100, 150]
+
+
 passing: list[Callable[[], None]] = []
 
 
@@ -230,6 +249,38 @@ def test_a_law_that_fails_or_takes_too_long_faults_the_controller_by_name(
     assert f"law {law}" in stage.shared.cause
     assert cause in stage.shared.cause
     assert [any(map(isnan, volts)) for volts in stage.commands] == [False] * valid + [True] * invalid
+
+
+def test_in_lockstep_a_law_may_take_its_time() -> None:
+    law = f"law.kind={__name__}:Dawdling"
+    arrivals = [arrival(k)._replace(at_ns=k * 1_000_000_000) for k in range(10)]
+    stage = Stage(arrivals, law, "law.at=1000", "loop.lockstep=true", "controller.duration_s=0.02")
+    passing.append(lambda: stage.link.advance(0.3))
+    assert stage.run()
+    assert len(stage.commands) == 10
+
+
+def test_frames_and_not_silent_ticks_count_as_received_and_what_a_link_refused_stays_counted() -> None:
+    sparse = ["wire.transmit.measurement=on_change", "wire.transmit.heartbeat_s=0.01"]
+    stage = Stage([arrival(k) for k in range(0, 50, 5)], *sparse, "controller.duration_s=0.08")
+    cast(Any, stage.link).refused = 3
+    assert stage.run()
+    counts = stage.shared.counts
+    assert (counts.ticks, counts.received, counts.refused) == (40, 8, 3)
+
+
+def test_of_a_flood_of_statuses_one_is_read_in_ten_milliseconds() -> None:
+    stage = Stage([])
+    for number in range(3):
+        stage.status_of_plant(f"s{number}")
+    read = []
+    for _ in range(3):
+        for _ in range(5):
+            status = stage.shared.plant.read()
+            assert status is not None
+        read.append(status.session)
+        stage.link.advance(0.01)
+    assert read == ["s0", "s1", "s2"]
 
 
 @pytest.mark.parametrize(
@@ -283,6 +334,17 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
     assert len(sent) == 4
     claims.keep(second)
     assert sent[4:] == [(topics.key("record", "aero"), second)]
+
+
+def test_a_session_is_released_once() -> None:
+    released: list[str] = []
+    claims = claims_of(SimpleNamespace(get=lambda key, **_: released.append(key) or []))
+    claims.release()
+    assert released == []
+    claims.session = "s"
+    claims.release()
+    claims.release()
+    assert released == [topics.key("release", "aero")]
 
 
 class AnsweringPlant:
