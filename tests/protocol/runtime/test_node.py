@@ -7,6 +7,7 @@ import time
 import zenoh
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Description, Status
 from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
 from tests.support.operated_loop import LEVEL as AT_REST
@@ -128,3 +129,11 @@ def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing()
         assert seen == [True]
         genuine.undeclare()
         eventually("it disappears", lambda: seen == [True, False])
+
+
+def test_a_description_names_the_process_as_its_statuses_do() -> None:
+    """So that a reader knows which of several controllers described itself."""
+    loop = Loop(AT_REST)
+    loop.role.status(Status(role="controller", state="running", uptime_s=0, ticks=0, rate_hz=0, skipped=0))
+    (description,), (status,) = loop.published("description", Description), loop.published("status", Status)
+    assert description.facts["process"] == status.process != ""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Status
+from aeroloop.protocol.messages.models import Event, Status, Telemetry
 from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter
 from aeroloop.service.config import load
 from aeroloop.service.console.feed import Feed, Vehicle, panels_of
 from aeroloop.service.logs.session import Array
 from aeroloop.service.logs.ticks import euler_deg
 from aeroloop.service.review.review import read
+from aeroloop.service.theorem.certificate import certify
 from tests.support.made_log import START_NS, VEHICLE, description, made, write
 
 TICKS = 1000
@@ -103,6 +106,28 @@ def test_a_bound_is_drawn_only_where_it_is_proven() -> None:
     assert "latency" not in {panel.group for panel in panels_of(load(overrides=["loop.lockstep=true"]), None)}
 
 
+def test_the_error_of_the_theorem_is_that_of_the_measurement_by_its_formula() -> None:
+    """z of (C.6): 1 − η, ε̃ and ω_e + C₁ ε̃, worked by hand for ε̃ = (0.6, 0, 0) and ω_e = (0, 0.3, 0)."""
+    settings, feed = load(overrides=["law.C1=[0.5,0.5,0.5]"]), Feed()
+    certificate = certify(settings).model_copy(update={"holds": True, "plant_radius": 0.2})
+    described = description(settings, "controller").model_copy(
+        update={"certificate": certificate.model_dump(mode="json")}
+    )
+    feed.take(topics.key("description", VEHICLE, role="controller"), described.encode(), 0.0, 0.0)
+    telemetry = Telemetry(
+        session="s1", tick=0, counter=0, attitude_error=(0.6, 0.0, 0.0), rate_error=(0.0, 0.3, 0.0),
+        desired=(1.0, 0.0, 0.0, 0.0), state={"sign": (1.0,)}, voltages=(0.0, 0.0),
+    )  # fmt: skip
+    feed.take(topics.key("telemetry", VEHICLE), telemetry.encode(), 0.0, 0.0)
+    for message in made(settings, 100):
+        if "/trace/plant" in message.key:
+            feed.take(message.key, message.payload, 0.0, 0.0)
+    at = 1 + feed.vehicles[VEHICLE].columns.index(("theorem", "‖z‖", "measured"))
+    rows = feed.block(VEHICLE, 0, 0, "")["rows"]
+    assert rows[0][at] == pytest.approx(sqrt(0.2**2 + 0.6**2 + 0.3**2 + 0.3**2), abs=1e-6)
+    assert rows[0][at + 1] == 0.2
+
+
 def test_of_several_controllers_the_one_with_the_session_is_shown() -> None:
     feed, key = Feed(), topics.key("status", VEHICLE, role="controller")
     spare = Status(role="controller", state="searching", process="spare", uptime_s=1, ticks=0, rate_hz=0, skipped=0)
@@ -126,10 +151,10 @@ def test_a_controller_that_is_refused_changes_nothing_of_what_is_shown() -> None
         "own": description(settings, "controller", process="own"),
         "refused": description(other, "controller", process="refused"),
     }
-    feed.take(keys["controller"], described["refused"].encode(), 0.0, 0.0)  # no plant and no status is known yet
-    assert vehicle.settings == other
+    for process in ("own", "refused"):
+        feed.take(keys["controller"], described[process].encode(), 0.0, 0.0)
     feed.take(keys["plant"], description(settings, "plant", process="plant").encode(), 0.0, 0.0)
-    feed.take(keys["controller"], described["own"].encode(), 0.0, 0.0)
+    assert vehicle.settings == other  # the newest, as no status is known yet
     feed.take(topics.key("status", VEHICLE, role="controller"), own.encode(), 0.0, 0.0)
     assert vehicle.settings == settings
     messages = [message for message in made(settings, 200) if "/trace/plant" in message.key]

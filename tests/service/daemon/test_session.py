@@ -13,7 +13,7 @@ import pytest
 from aeroloop import Now
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Grant, Refusal, SessionRecord, Status, Telemetry
-from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.messages.operator import Answer, Hold, Message, Track
 from aeroloop.protocol.messages.states import ControllerState, ControllerTrigger
 from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
 from aeroloop.protocol.runtime import node
@@ -29,7 +29,7 @@ from aeroloop.service.daemon.claim import ClaimClient
 from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.daemon.session import Session, Shared
 from tests.support.failing_laws import FAILING, Failing
-from tests.support.operated_loop import LonelyNode, Network
+from tests.support.operated_loop import LonelyNode, Network, Query
 from tests.support.plant_end import record_of
 from tests.support.simulated_link import PERIOD_NS, SimulatedLink
 
@@ -194,6 +194,26 @@ def test_each_session_begins_with_a_law_that_has_learned_nothing(monkeypatch: py
     for session in granted:
         states = [batch.tail.state for batch in stage.batches if batch.header.session == session and batch.header.rows]
         assert states[0] == initial != states[-1]
+
+
+def test_a_status_says_at_once_what_an_operator_has_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within its second: the session lasts 40 ms after the request."""
+    law = f"law.kind={__name__}:Dawdling"
+    stage = Stage(map(arrival, range(20)), law, "law.at=1000", "loop.realtime=off", "controller.duration_s=0.04")
+    track = Query(topics.key("track", "aero"), Track(reference=Hold(attitude=(0.0, 0.0, 5.0))).encode())
+    passing.append(lambda: stage.network.queryables[track.key_expr](track))
+
+    def claim(client: ClaimClient) -> ZenohLink:
+        stage.link.advance(0.001)
+        client.session = SESSION
+        return stage.session_link
+
+    monkeypatch.setattr(ClaimClient, "claim", claim)
+    Daemon(stage.role, stage.settings).run()
+    assert track.answers[0].done
+    key = topics.key("status", "aero", role="controller")
+    statuses = [Status.model_validate_json(payload) for at, payload in stage.network.put if at == key]
+    assert "roll, pitch, yaw 0°, 0°, 5°" in {status.reference for status in statuses if status.session == SESSION}
 
 
 def test_a_measurement_without_a_valid_value_is_answered_by_none_until_there_is_one() -> None:

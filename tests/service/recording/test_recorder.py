@@ -296,6 +296,22 @@ def test_a_full_disk_is_reported_and_what_its_cache_holds_no_longer_is_counted_i
     assert running.error is None
 
 
+def test_losses_of_several_keys_add_up_in_the_status(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their publishers have no cache; a time-out is short, so that what does not answer is soon given up."""
+    monkeypatch.setattr(history, "ANSWER_S", 0.1)
+    running, other = record(), KEY.replace("aero/", "beta/")
+    for key, lost in ((KEY, 10), (other, 5)):
+        publish_without_cache(gathering, key, {number: bytes(4) for number in (0, lost + 1)})
+    running.await_written(6)
+    running.end()
+    assert sorted(running.losses()) == [(KEY, 10, "gone"), (other, 5, "gone")]
+    status = running.last_status()
+    assert status.lost == 15
+    assert status.notes[0].startswith("15 messages lost: not received")
+
+
 @pytest.mark.realtime
 def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gathering, record: Record) -> None:
     """A publisher without a cache: what it did not publish cannot be recovered."""
