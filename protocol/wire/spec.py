@@ -145,7 +145,7 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
 
     def acceptance(self, direction: Literal["measurement", "command"], *, lockstep: bool) -> Callable[[bytes], bool]:
-        """Tells of a received frame whether it may take the place of one that waits to be taken.
+        """A function: whether a received frame may take the place of one that waits to be taken.
 
         In real time a well-formed one may. In lockstep any of the right length may, as each frame is waited for: a
         malformed one counts as the one that was due, and so does an empty one, which stands for silence on change.
