@@ -10,6 +10,8 @@ from typing import Any, Final, get_args
 from pydantic import BaseModel, BeforeValidator, ValidationError
 from pydantic.fields import FieldInfo
 
+from aeroloop.protocol.printable import printable
+
 SHOWN: Final = 60  # characters of a refused value or an unknown key
 _SAID: Final = 600  # characters of pydantic's words, which may quote what was given
 
@@ -73,5 +75,5 @@ def problem(error: ValidationError, *models: type[BaseModel]) -> str:
 
 def _line(text: str, length: int) -> str:
     """A text as one printable line, shortened."""
-    shown = "".join(character if character.isprintable() else " " for character in text[:length])
+    shown = printable(text[:length])
     return shown if len(text) <= length else f"{shown}…"

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, StringConstraints, ValidationError, model
 from aeroloop.protocol.errors import ConfigError as ConfigError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.wording import closest, keys, problems
+from aeroloop.protocol.wording import SHOWN, closest, keys, problems
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -29,6 +29,11 @@ ENV_PREFIX: Final = "AEROLOOP_"
 
 BODY: Final = ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
 """The model of the plant in `[law]`, which all laws have."""
+
+MAX_DEPTH: Final = 32
+"""Sections and lists within each other, more than any setting needs."""
+
+_TOO_DEEP: Final = f"nested too deeply, more than {MAX_DEPTH} sections or lists within each other"
 
 _FREE: Final = ("can.options.", "plant.own.", "law.")
 """Sections in which any key may be given: a user's, or another library's."""
@@ -88,7 +93,7 @@ def _file(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"no configuration file at {path}")
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        tree = _parsed(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
     except tomllib.TOMLDecodeError as error:
@@ -96,6 +101,29 @@ def _file(path: Path) -> dict[str, Any]:
     reference = tree.get("reference")
     if isinstance(reference, dict) and isinstance(reference.get("path"), str):
         reference["path"] = str(path.parent / reference["path"])
+    return tree
+
+
+def _parsed(text: str, source: str) -> dict[str, Any]:
+    """TOML as a tree. Raises ConfigError, which names the source, where it is nested too deeply to be walked through.
+
+    Raises tomllib.TOMLDecodeError if it is not TOML.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{source}: {_TOO_DEEP}") from None
+    layer: list[Any] = [tree]
+    for _ in range(MAX_DEPTH):
+        below: list[Any] = []
+        for node in layer:
+            if isinstance(node, dict):
+                below += node.values()
+            elif isinstance(node, list):
+                below += node
+        layer = below
+    if layer:
+        raise ConfigError(f"{source}: {_TOO_DEEP}")
     return tree
 
 
@@ -135,9 +163,11 @@ def tree_of(overrides: Iterable[str]) -> dict[str, Any]:
         key, equals, text = override.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set takes section.key=value, not {override!r}")
+        if key.count(".") >= MAX_DEPTH:
+            raise ConfigError(f"--set {key[:SHOWN]}…: {_TOO_DEEP}")
         value: Any = text.strip()
         with suppress(tomllib.TOMLDecodeError):  # else a string without quotes
-            value = tomllib.loads(f"value = {value}")["value"]
+            value = _parsed(f"value = {value}", f"--set {key[:SHOWN]}")["value"]
         for name in reversed(key.strip().split(".")):
             value = {name: value}
         tree = merged(tree, value, one_source=True)

@@ -29,7 +29,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject, Mark, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome, batches_per_s, record_json
+from aeroloop.protocol.messages.trace import Outcome, record_json
 from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import LatencyHistogram, RollingHistogram
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
@@ -100,7 +100,7 @@ class ZenohNetwork(PlantNetwork):
 
     def serve(self) -> None:
         role = self._role
-        role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
+        role.declare("trace", lossless=self._loop.lockstep)
         if not self._loop.lockstep:
             role.datagrams.listen()
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
@@ -157,11 +157,8 @@ class ZenohNetwork(PlantNetwork):
     def follow_session(self) -> None:
         endpoint = self._endpoint
         self._trace.follow(endpoint)
-        if endpoint.session is None and self._link is not None:
-            self._link.close()
-            self._refused += self._link.refused
-            self._link = None
-            self._forget_holder()
+        if endpoint.session is None:
+            self._close_link()
         if endpoint.notices:
             self._keep_latch()
             for notice in endpoint.notices:
@@ -222,12 +219,13 @@ class ZenohNetwork(PlantNetwork):
             text = f"{claim.controller} refused: {answer.reason}"
             role.warn(text, "refused", text, claim.session)
             return answer
+        self._close_link()  # of a session that ended in the same batch of requests
         self._sent_at = [(-1, 0)] * self._counters
         self._link = ZenohLink(  # before the grant is sent, so that the first command is not lost
             role.zenoh,
             send_key=topics.key("measurement", role.vehicle, session=claim.session),
             receive_key=topics.key("command", role.vehicle, session=claim.session),
-            lengths=self._endpoint.wire.lengths("command", lockstep=self._loop.lockstep),
+            accepts=self._endpoint.wire.acceptance("command", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
             changed=self._changed,
             also=self._role.datagrams.session,
@@ -239,6 +237,14 @@ class ZenohNetwork(PlantNetwork):
 
         self._forget_holder = role.watch_token(claim.controller, seen)
         return answer
+
+    def _close_link(self) -> None:
+        """Close the link of the session that has ended, if there is one."""
+        if self._link is not None:
+            self._link.close()
+            self._refused += self._link.refused
+            self._link = None
+            self._forget_holder()
 
     def _release(self, release: Release) -> Answer:
         done = self._endpoint.release(release.session)

@@ -122,7 +122,10 @@ class Description(Message):
     vehicle: str
     host: str
     versions: dict[str, str]
-    facts: dict[str, str] = Field(default_factory=dict, description="the host, and its properties that affect timing")
+    facts: dict[str, str] = Field(
+        default_factory=dict,
+        description="the host, and its properties that affect timing; `process` as in the status of the same process",
+    )
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
     certificate: dict[str, Any] | None = Field(
         default=None, description="controller: of its configuration, as `aeroloop lab certify --json` prints it"

@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
 from aeroloop.protocol.messages.operator import AS_PUBLISHED, Change, Message, in_force
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.wire.spec import MAX_ACTUATORS, LoopSettings, WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 
 Columns = dict[str, npt.NDArray[Any]]
 End = Literal["controller", "plant"]
@@ -37,8 +37,6 @@ NEVER: Final = 0xFFFF_FFFF
 after every row."""
 RECORD_S: Final = 1.0  # how often a batch has the session's record
 _RECORD_BYTES_PER_S: Final = 16_384  # a longer record, of many points, is in as many batches as take this much
-_BATCHES_BEYOND: Final = 1.25  # those of sessions that begin and end, and of operations between them
-_FASTEST_HZ: Final = 10_000.0  # bound on the tick rate in lockstep, where the grid's rate does not apply
 _HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
 HEADER_BYTES: Final = _HEADER.size
 _FINAL: Final = 1
@@ -318,9 +316,3 @@ class TraceWriter:
 def record_json(changes: Sequence[Change]) -> bytes:
     """Changes in force as `TraceWriter.record` has them; empty for none."""
     return b"[" + b",".join(change.encode() for change in changes) + b"]" if changes else b""
-
-
-def batches_per_s(loop: LoopSettings) -> float:
-    """Bound on the batches that an end publishes per second, in the long run."""
-    rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
-    return _BATCHES_BEYOND * max(1e9 / TRACE_NS, rate_hz / MAX_ROWS)

@@ -40,7 +40,6 @@ ASKED_BY: Final = ContextVar("asked by", default="")
 GHOST_S: Final = 3.0  # how long the token of a plant that does not answer has to disappear
 GHOST_POLL_S: Final = 0.1
 _RECENT_S: Final = 10.0
-_SELDOM_PER_S: Final = 8.0  # cached messages of a topic that was not declared beforehand: statuses, events
 _GRAVE: Final = ("tripped", "lost", "fault", "refused")
 
 log: Final = logging.getLogger("aeroloop")
@@ -268,10 +267,10 @@ class Node:
 
     # ── publications ──
 
-    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+    def declare(self, topic: str, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
         key, json = topics.key(topic, self.vehicle, role=self.role), topics.TOPICS[topic].kind == "json"
-        self._publishers[topic] = CachedPublisher(self.zenoh, key, per_s, lossless=lossless, json=json)
+        self._publishers[topic] = CachedPublisher(self.zenoh, key, lossless=lossless, json=json)
 
     def publish(self, topic: str, message: Message) -> None:
         """Publish a message on one of the table's JSON topics."""
@@ -284,7 +283,7 @@ class Node:
             self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
             return
         if topic not in self._publishers:
-            self.declare(topic, _SELDOM_PER_S)
+            self.declare(topic)
         self._publishers[topic].put(payload)
 
     def publish_description(
@@ -297,7 +296,7 @@ class Node:
             vehicle=self.vehicle,
             host=socket.gethostname(),
             versions=versions() | (law or {}),
-            facts=host_facts(),
+            facts=host_facts() | {"process": self.process},
             config=config,
             certificate=certificate,
         ).encode()

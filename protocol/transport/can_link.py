@@ -29,7 +29,6 @@ from aeroloop.protocol.transport.can_format import (
 )
 from aeroloop.protocol.transport.link import Link
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _BUS_OFF: Final = 0x40  # of a SocketCAN error frame's id
 _RECEIVE_S: Final = 0.1
@@ -64,7 +63,7 @@ class CanLink(Link):
         self._receive_id, self._peer_beat_id = (each + settings.node for each in taken)
         self._settings = settings
         self._size = getattr(wire, received).size
-        self._may_be_silent = len(UNCHANGED) in wire.lengths(received, lockstep=lockstep)
+        self._accepts = wire.acceptance(received, lockstep=lockstep)
         self._patience_s = LOCKSTEP_SILENT_S if lockstep else SILENT_S
         self._reopen_due = self._beat_due = 0.0
         self._sent: Heartbeat | None = None  # the last heartbeat sent
@@ -170,11 +169,11 @@ class CanLink(Link):
     def _accept(self, identifier: int, data: bytes) -> None:
         now, size = time.monotonic_ns(), self._size
         if identifier == self._receive_id:
-            silent = data == UNCHANGED and self._may_be_silent
-            padded = len(data) == size or (len(data) > size > CLASSIC_BYTES and not any(data[size:]))
-            if silent or padded:
+            is_filled_up = len(data) > size > CLASSIC_BYTES and not any(data[size:])  # to a length that CAN FD has
+            frame = data[:size] if is_filled_up else data
+            if self._accepts(frame):
                 self.peer_ns = now
-                self.put(data[:size])
+                self.put(frame)
             else:
                 self.refused += 1
         elif identifier == self._peer_beat_id:

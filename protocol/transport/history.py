@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import ceil, inf
+from math import inf
 from threading import Lock
 from typing import Final, NamedTuple
 
@@ -25,6 +25,10 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, LossReason
 
 KEPT_S: Final = 65.0  # for so long publishers keep what they publish; one that has been silent for so long is gone
+LEAST_KEPT: Final = 520  # messages that a publisher keeps whatever their age: a description is published once
+MOST_PER_S: Final = 10_000  # messages that a publisher may publish: one a tick of the fastest loop
+MOST_KEPT: Final = 2 * round(KEPT_S) * MOST_PER_S  # messages that a publisher may keep
+LARGEST_NUMBER: Final = 2**53  # JSON holds counts up to it exactly; at `MOST_PER_S` it takes 28 000 years to reach
 ANSWER_S: Final = 3.0  # time-out of a query
 SOON_S, SELDOM_S = 0.025, 0.5  # pause between two queries while pages bring messages, and else
 PAGE_BYTES: Final = 16_384  # of a page with more than one message: 64 kbit/s carry it in 2 s
@@ -93,18 +97,27 @@ def page(data: bytes, publisher: int, kept: Sequence[tuple[int, int, bytes]]) ->
 class CachedPublisher:
     """Publishes on one key, from any thread, and answers for the last messages. The session outlives the publisher.
 
-    `per_s` bounds the messages per second, in the long run. If `lossless`, for lockstep, it waits for peers that do not
-    keep up instead of dropping. `json` is whether the messages are JSON.
+    It keeps what it published in the last `KEPT_S`, by `clock` [s], and never fewer than the last `LEAST_KEPT`.
+    If `lossless`, for lockstep, it waits for peers that do not keep up instead of dropping. `json` is whether the
+    messages are JSON.
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, per_s: float, *, lossless: bool = False, json: bool = True
+        self,
+        session: zenoh.Session,
+        key: str,
+        *,
+        lossless: bool = False,
+        json: bool = True,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         encoding = zenoh.Encoding.APPLICATION_JSON if json else zenoh.Encoding.ZENOH_BYTES
         self._publisher = session.declare_publisher(key, encoding=encoding, congestion_control=control)
         self._id, self._count = secrets.randbits(64), 0
-        self._kept: deque[tuple[int, int, bytes]] = deque(maxlen=ceil(KEPT_S * per_s))
+        self._kept: deque[tuple[int, int, bytes]] = deque()
+        self._kept_since: deque[float] = deque()  # when each of them was published, by `clock`
+        self._clock = clock
         self._lock, self._cache_key = Lock(), topics.cache_key(key)
         # Answered in a thread of Python: in Zenoh's own, all else would wait while a slow peer takes a page.
         self._queryable = session.declare_queryable(self._cache_key, self._answer)
@@ -115,13 +128,25 @@ class CachedPublisher:
             number, clock_ns = self._count, time.time_ns()
             self._count += 1
             self._kept.append((number, clock_ns, payload))
+            self._kept_since.append(self._clock())
+            self._drop_old()
             self._publisher.put(payload, attachment=attachment(clock_ns, self._id, number))
 
+    def _drop_old(self) -> None:
+        """Drop what need not be kept: two messages at the most, as thousands at once would hold up a loop."""
+        before = self._kept_since[-1] - KEPT_S
+        for _ in range(2):
+            if len(self._kept) > LEAST_KEPT and self._kept_since[0] < before:
+                self._kept.popleft()
+                self._kept_since.popleft()
+
     def _answer(self, asked: zenoh.Query) -> None:
+        wanted = asked.payload.to_bytes() if asked.payload else b""
         with asked, suppress(zenoh.ZError):  # closed meanwhile
+            # Of tens of thousands that may be kept, a page has a few: copying all would take longer than the page.
             with self._lock:
-                kept = list(self._kept)
-            if (answer := page(asked.payload.to_bytes() if asked.payload else b"", self._id, kept)) is not None:
+                answer = page(wanted, self._id, self._kept)
+            if answer is not None:
                 asked.reply(self._cache_key, answer)
 
 
@@ -134,6 +159,7 @@ class _Source:
     since: int  # number of the first contact: what is older is not lost if a cache drops it
     seen: float  # when something was last received of it [s]
     end: int = 0  # after the last number that is known
+    newest: int = -1  # the highest number that was received
     answered: bool = False
     lacks: list[Range] = field(default_factory=list)  # ascending
 
@@ -149,13 +175,40 @@ class _Source:
         at = bisect_right(self.lacks, (number, _END)) - 1
         if at < 0 or number >= self.lacks[at][1]:
             return False
+        self.newest = max(self.newest, number)
         first, end = self.lacks[at]
         self.lacks[at : at + 1] = [each for each in ((first, number), (number + 1, end)) if each[0] < each[1]]
         return True
 
+    def was_given_up(self, number: int) -> bool:
+        """Whether a number that was not received yet, as it is above all that were, lacks no more."""
+        if not self.newest < number < self.end:
+            return False
+        return not any(first <= number < end for first, end in self.lacks)
+
+    def go_back(self, number: int) -> int:
+        """Go back to what was known before a page that gave up a number, which was published only now.
+
+        Returns how many numbers lack again that were counted as lost.
+        """
+        first_unreceived = self.newest + 1
+        counted_from = max(first_unreceived, self.since)
+        still_lacking = sum(max(0, end - max(first, counted_from)) for first, end in self.lacks)
+        counted = max(0, self.end - counted_from - still_lacking)
+        before = [(first, min(end, first_unreceived)) for first, end in self.lacks if first < first_unreceived]
+        self.lacks = [*before, (first_unreceived, number + 1)]
+        self.end = number + 1
+        self.since = min(self.since, number)
+        return counted
+
 
 class RecoveringSubscriber:
-    """Subscriber that queries publishers' caches for what it did not receive. The session outlives it; `clock` in s."""
+    """Subscriber that queries publishers' caches for what it did not receive. The session outlives it; `clock` in s.
+
+    Anyone may publish and answer where links have no certificates. A number that no publisher can have reached by now
+    is refused: a message is then one without a number, a page is ignored. A page may still say that a publisher is
+    ahead, and that it keeps nothing: the next message that is published refutes that.
+    """
 
     def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._session, self._cache_key, self._clock, self._lock = session, topics.cache_key(key), clock, Lock()
@@ -191,7 +244,7 @@ class RecoveringSubscriber:
                 there = self._reachable(source) and source.answered
                 self._give_up(source, source.end, "end" if there else "gone")
             lost, self._lost = self._lost, Counter()
-        return [Loss(key=key, count=count, reason=reason) for (key, reason), count in lost.items()]
+        return [Loss(key=key, count=count, reason=reason) for (key, reason), count in lost.items() if count]
 
     def silent(self) -> dict[str, float]:
         """For how long nothing was received of publishers that cannot be reached and may still have messages [s]."""
@@ -238,7 +291,13 @@ class RecoveringSubscriber:
             if message.publisher is None:
                 self._add(message)
                 return
+            if not self._is_plausible(message.key, message.publisher, message.number):
+                self._add(message._replace(publisher=None, number=0))
+                return
             source = self._source(message.key, message.publisher, message.number)
+            if source.was_given_up(message.number):
+                counted = source.go_back(message.number)
+                self._lost[source.key, "cache"] = max(0, self._lost[source.key, "cache"] - counted)
             source.extend(message.number + 1)
             self._add(message, source)
             if len(source.lacks) > MOST:
@@ -249,14 +308,18 @@ class RecoveringSubscriber:
         if reply.ok is None or len(data := reply.ok.payload.to_bytes()) < _PAGE.size:
             return
         key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
+        if not oldest <= count <= oldest + MOST_KEPT:
+            return
         at, found = _PAGE.size, list[Delivery]()
         while at + _ITEM.size <= len(data):
             number, clock_ns, length = _ITEM.unpack_from(data, at)
             at += _ITEM.size + length
             found.append(Delivery(key, data[at - length : at], number, max(0, clock_ns), publisher))
-        if at != len(data):
+        if at != len(data) or not all(oldest <= delivery.number < count for delivery in found):
             return
         with self._lock:
+            if not self._is_plausible(key, publisher, count):
+                return
             source = self._source(key, publisher, count)
             source.extend(count)
             new = [self._add(each, source) for each in reversed(found)]
@@ -264,6 +327,14 @@ class RecoveringSubscriber:
             source.answered = True
             if any(new):
                 self._paged = self._clock()
+
+    def _is_plausible(self, key: str, publisher: int, number: int) -> bool:
+        """Whether a publisher may have come as far as this number since something of it was received."""
+        source = self._sources.get((key, publisher))
+        if source is None:
+            return number <= LARGEST_NUMBER
+        ahead = MOST_PER_S * (self._age(source) + KEPT_S)  # its messages may have been held up for up to `KEPT_S`
+        return number <= min(LARGEST_NUMBER, source.end + ahead)
 
     def _source(self, key: str, publisher: int, since: int) -> _Source:
         now = self._clock()

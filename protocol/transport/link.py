@@ -1,7 +1,7 @@
 """Links: carry frames between the two ends, without a queue, by the same calls on every transport.
 
 A received frame replaces one that was not yet taken: a loop needs the newest sample, and a queue would only delay it. A
-frame of a wrong length is refused before it could replace one.
+frame that cannot be read is refused before it could replace one.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Container
+from collections.abc import Callable
 from threading import Condition
 from typing import Any, NamedTuple
 
@@ -72,9 +72,10 @@ class Link(Mailbox, ABC):
 class ZenohLink(Link):
     """Frames over Zenoh: express, at real-time priority. The session outlives the link.
 
-    `lengths` are those of the frames received [bytes]; `refused` counts frames of any other. If `lossless`, `send`
-    blocks when a peer does not keep up, instead of dropping: for lockstep, where each frame is waited for. A plant's
-    link may have a second session, `also`: frames are received on both, and sent on that which has a subscriber.
+    A received frame that `accepts` says no to is dropped and counted by `refused`; it is called for each frame in
+    Zenoh's thread. If `lossless`, `send` blocks when a peer does not keep up, instead of dropping: for lockstep, where
+    each frame is waited for. A plant's link may have a second session, `also`: frames are received on both, and sent on
+    that which has a subscriber.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class ZenohLink(Link):
         session: zenoh.Session,
         send_key: str,
         receive_key: str,
-        lengths: Container[int],
+        accepts: Callable[[bytes], bool],
         *,
         lossless: bool = False,
         changed: Condition | None = None,
@@ -95,7 +96,7 @@ class ZenohLink(Link):
 
         def receive(sample: zenoh.Sample) -> None:
             frame = sample.payload.to_bytes()
-            if len(frame) in lengths:
+            if accepts(frame):
                 self.put(frame)
             else:
                 self.refused += 1

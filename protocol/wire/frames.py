@@ -39,8 +39,9 @@ class FrameFormat:
         zeros = [f"p{n}" if n else "" for n in (gap, tail)]
         layout = compile_bits("".join([f"u{counter_bits}", zeros[0], *fields, zeros[1]]))
         self._pack, self._unpack = layout.pack, layout.unpack
-        masks = (self.first_bit // 8 - 1, (1 << gap) - 1), (self.size - 1, (1 << tail) - 1)
-        self._padding = [(byte, mask) for byte, mask in masks if mask]
+        after_counter = ((1 << gap) - 1) << (8 * self.size - self.first_bit)
+        at_the_end = (1 << tail) - 1
+        self._padding = after_counter | at_the_end  # bits of a frame that are zero
 
     def pack(self, counter: int, codes: Sequence[float]) -> bytes:
         """Bytes of a frame. Codes are ints within R-bit two's complement, or floats where nothing is quantized.
@@ -64,13 +65,16 @@ class FrameFormat:
         read = self.unpack(frame)
         return None if read is None else read[0]
 
+    def is_well_formed(self, frame: bytes) -> bool:
+        """Whether a frame can be unpacked. Cheap where nothing is a float: then only its length and padding count."""
+        if self._floats:
+            return self.unpack(frame) is not None
+        return len(frame) == self.size and not int.from_bytes(frame) & self._padding
+
     def unpack(self, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
         """Counter and codes of a frame, or None if it is malformed: wrong length, non-zero padding, infinite float."""
-        if len(frame) != self.size:
+        if len(frame) != self.size or int.from_bytes(frame) & self._padding:
             return None
-        for byte, mask in self._padding:
-            if frame[byte] & mask:
-                return None
         values = self._unpack(frame)
         codes = values[1:]
         for i in self._floats:

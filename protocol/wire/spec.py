@@ -5,6 +5,7 @@ Claims, fingerprints, frames, the DBC and log readers derive every scale and wid
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -143,11 +144,19 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         """Format of a command frame: u₁…uₙ, or u₂ u₃ if there are two."""
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
 
-    def lengths(self, direction: Literal["measurement", "command"], *, lockstep: bool) -> frozenset[int]:
-        """Lengths of well-formed frames of a direction [bytes]: 0, too, where an empty frame stands for silence."""
-        frame = self.measurement if direction == "measurement" else self.command
-        policy = getattr(self.transmit, direction)
-        return frozenset((frame.size, 0) if lockstep and policy == "on_change" else (frame.size,))
+    def acceptance(self, direction: Literal["measurement", "command"], *, lockstep: bool) -> Callable[[bytes], bool]:
+        """A function: whether a received frame may take the place of one that waits to be taken.
+
+        In real time a well-formed one may. In lockstep any of the right length may, as each frame is waited for: a
+        malformed one counts as the one that was due, and so does an empty one, which stands for silence on change.
+        """
+        layout = self.measurement if direction == "measurement" else self.command
+        if not lockstep:
+            return layout.is_well_formed
+        lengths = {layout.size}
+        if getattr(self.transmit, direction) == "on_change":
+            lengths.add(0)
+        return lambda frame: len(frame) in lengths
 
     @property
     def motors(self) -> range:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.printable import printable
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -73,7 +76,12 @@ def fail(message: str, code: int) -> NoReturn:
 
 def report(message: str) -> None:
     """Print one line on stderr."""
-    typer.echo(f"aeroloop: {message}", err=True)
+    typer.echo(f"aeroloop: {printable(message)}", err=True)
+
+
+def say(message: str) -> None:
+    """Print one line, as a role answered it."""
+    typer.echo(printable(message))
 
 
 def load_settings(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
@@ -107,6 +115,10 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
         fail(problem(error, *models) if isinstance(error, ValidationError) else str(error), 2)
 
 
+def _escaped(character: str) -> str:
+    return character if character.isprintable() else dumps(character)[1:-1]
+
+
 def working(title: str, hidden: bool, total: float | None = None) -> AbstractContextManager[Callable[..., None]]:
     """A progress bar: `update(done, total)`; hidden where JSON is printed."""
     from aeroloop.service.terminal.show import progress_bar
@@ -121,7 +133,9 @@ def show(result: Result, json: bool, sheets: Callable[[Result], Sheets], markdow
     from aeroloop.service.terminal import show as printer
 
     if json:
-        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
+        text = to_json(result, indent=2, inf_nan_mode="null").decode()
+        # JSON escapes control characters of ASCII; the others of Unicode are escaped here, and mean the same.
+        typer.echo(re.sub(r"[^\n -~]", lambda found: _escaped(found[0]), text))
     elif markdown:
         typer.echo(printer.markdown(sheets(result)))
     else:

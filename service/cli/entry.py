@@ -72,6 +72,15 @@ def run_alone(run: Callable[[Event], None]) -> None:
     run(stop)
 
 
+class _OneLine(logging.Formatter):
+    """Formats a record as one printable line, whatever names and texts of the network it has."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # of the library
+        from aeroloop.protocol.printable import printable
+
+        return printable(super().formatMessage(record))
+
+
 def _stop_on_signals() -> tuple[Event, Event]:
     """Log to stderr, and return events: one to set once the process has begun, one that a signal to stop sets.
 
@@ -80,7 +89,7 @@ def _stop_on_signals() -> tuple[Event, Event]:
     """
     handler = logging.StreamHandler()
     line = "%(asctime)s %(levelname)s %(role)s: %(message)s"
-    handler.setFormatter(logging.Formatter(line, defaults={"role": "aeroloop"}))
+    handler.setFormatter(_OneLine(line, defaults={"role": "aeroloop"}))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     begun, stop, signals = Event(), Event(), {signal.SIGTERM, signal.SIGINT}
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; else a closed terminal

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, show
+from aeroloop.service.cli.common import Address, Config, Json, Overrides, Port, checked, fail, report, say, show
 from aeroloop.service.cli.entry import run_alone
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def stop(
     target, vehicle = _target(config, overrides)
     from aeroloop.service.host.operator import stop as stop_plants
 
-    _, failures = stop_plants(target.network, None if every else vehicle, on_answer=typer.echo)
+    _, failures = stop_plants(target.network, None if every else vehicle, on_answer=say)
     if failures:
         fail("; ".join(failures), 1)
 
@@ -279,4 +279,4 @@ def _send(config: Path | None, overrides: Sequence[str] | None, topic: str, mess
     from aeroloop.service.host.operator import only_vehicle, send
 
     vehicle = vehicle or only_vehicle(target.network) or target.vehicle
-    typer.echo(send(target.network, vehicle, topic, message or Request()))
+    say(send(target.network, vehicle, topic, message or Request()))

@@ -24,11 +24,12 @@ from aeroloop.protocol.messages.models import Description, Event, Status, Teleme
 from aeroloop.protocol.messages.operator import MessageError
 from aeroloop.protocol.messages.trace import NEVER, Batch, Outcome, Sent, read_batch
 from aeroloop.protocol.wire.attitude import IDENTITY, angle, received_quaternion, to_euler
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import initial_state, law_of
 from aeroloop.service.host.health import replaces
 from aeroloop.service.host.operator import Gathered
+from aeroloop.service.review.panels import state_panels
 from aeroloop.service.review.report import Findings, Line, Panel, Report
 from aeroloop.service.theorem.certificate import Certificate
 
@@ -36,6 +37,8 @@ LAST_S: Final = 60.0
 """What of the columns is kept and shown."""
 ROWS_HZ: Final = 50.0
 EVENTS: Final = 200
+DESCRIBED: Final = 16
+"""Processes of a vehicle whose descriptions are kept."""
 SHOWN: Final = ("description", "status", "telemetry", "event", "trace")
 
 Column = tuple[str, str, str]  # group of panels, panel, quantity
@@ -59,11 +62,8 @@ def panels_of(settings: Settings, radius: float | None) -> list[Panel]:
     if not settings.loop.lockstep:
         found.append(panel("latency", "Loop latency", "latency", "ms", "latency"))
     with suppress(AeroloopError):  # a law of one's own may not be installed here
-        for name, values in initial_state(law_of(settings.law, settings.loop.period, settings.wire.actuators)).items():
-            if name == "sign":  # of the equilibrium
-                continue
-            title, symbol = name.replace("_", " ").capitalize(), {"damping_estimate": "θ̂"}.get(name, name)
-            found += [panel(name, title, f"{symbol}{i + 1}", "1", "estimated") for i in range(len(values))]
+        for drawn in state_panels(settings):
+            found += [panel(drawn.name, drawn.title, label, drawn.unit, "estimated") for label in drawn.labels]
     if radius is not None:
         found.append(panel("theorem", "Error of Theorem 1", "‖z‖", "1", "measured", "bound"))
     return [*found, *attitude]
@@ -75,9 +75,11 @@ class Vehicle:
     def __init__(self, name: str) -> None:
         self.name = name
         self.statuses: dict[str, tuple[float, Status]] = {}  # by role, with when it was received [s]
-        self.described: dict[str, Description] = {}
+        self._described: dict[tuple[str, str], Description] = {}  # by role and process, the newest last
+        self._sources: tuple[Description | None, ...] = ()  # descriptions of the plant and the controller in use
         self.telemetry: deque[Telemetry] = deque(maxlen=16)  # of the session, the newest last
-        self.settings: Settings | None = None
+        self.settings: Settings | None = None  # of the controller, else of the plant
+        self._wire: WireSpec | None = None  # of the plant, else of the controller
         self.radius: float | None = None  # of ‖z‖, where it is proven
         self.verdict = ""  # of the certificate
         self.panels: list[Panel] = []
@@ -91,13 +93,31 @@ class Vehicle:
 
     def describe(self, description: Description) -> None:
         """Take a role's description; of the ends it says how frames are read and what is drawn."""
-        if self.described.get(description.role) == description or description.role not in ("plant", "controller"):
+        if description.role not in ("plant", "controller"):
             return
-        self.described[description.role] = description
-        source = self.described.get("controller", description)
+        process = description.role, description.facts.get("process", "")
+        self._described.pop(process, None)
+        self._described[process] = description
+        if len(self._described) > DESCRIBED:
+            unused = (process for process, each in self._described.items() if each not in self._sources)
+            del self._described[next(unused)]
+        self.follow_descriptions()
+
+    def follow_descriptions(self) -> None:
+        """Use the descriptions of the processes whose statuses are shown: of controllers, of that with the session."""
+        plant, controller = self._description_of("plant"), self._description_of("controller")
+        if (plant, controller) == self._sources:
+            return
+        self._sources = plant, controller
+        source = controller or plant
+        if source is None:
+            return
         with suppress(ConfigError):
-            self.settings = from_description(source.config)
-            self._level = self.settings.wire.attitude.quantizer().level
+            settings = from_description(source.config)
+            # The plant's frames are read as the plant describes them; a claim is granted for the same wire only.
+            self._wire = from_description(plant.config).wire if plant is not None else settings.wire
+            self._level = self._wire.attitude.quantizer().level
+            self.settings = settings
             self.radius, self.verdict = None, ""
             with suppress(ValidationError):  # none, or of another version
                 certificate = Certificate.model_validate(source.certificate)
@@ -107,6 +127,14 @@ class Vehicle:
             self.panels = panels_of(self.settings, self.radius)
             self.generation += 1
             self.rows.clear()
+
+    def _description_of(self, role: str) -> Description | None:
+        """The description of the process whose status is shown; of none such the newest of the role."""
+        of_role = [each for (described_role, _), each in self._described.items() if described_role == role]
+        if role in self.statuses:
+            _, status = self.statuses[role]
+            of_role = [self._described[role, status.process]] if (role, status.process) in self._described else of_role
+        return of_role[-1] if of_role else None
 
     @property
     def columns(self) -> list[Column]:
@@ -121,10 +149,16 @@ class Vehicle:
 
     def add(self, batch: Batch) -> None:
         """Add rows of the plant's trace."""
-        settings, columns = self.settings, batch.columns
-        if settings is None or batch.header.end != "plant" or not batch.header.session or not batch.header.rows:
+        settings, wire, columns = self.settings, self._wire, batch.columns
+        if (
+            settings is None
+            or wire is None
+            or batch.header.end != "plant"
+            or not batch.header.session
+            or not batch.header.rows
+        ):
             return
-        if batch.header.measurement_bytes != settings.wire.measurement.size:
+        if batch.header.measurement_bytes != wire.measurement.size:
             return
         if batch.header.session != self.session:
             self.session, self.count = batch.header.session, 0
@@ -135,15 +169,15 @@ class Vehicle:
         for i, tick in enumerate(columns["session_tick"].tolist()):
             if columns["sent_as"][i] == Sent.FRAME:
                 self._sent_us.append((tick, base_us + int(columns["sent"][i])))
-                self._read(settings, columns["measurement"][i].tobytes())
+                self._read(wire, columns["measurement"][i].tobytes())
             if tick % stride == 0:
                 latency = self._latency_ms(columns, i, base_us)
                 self.rows.append(self._row(settings, tick, columns["voltages"][i].tolist(), latency))
                 self.count += 1
 
-    def _read(self, settings: Settings, frame: bytes) -> None:
+    def _read(self, wire: WireSpec, frame: bytes) -> None:
         """Take the attitude of a measurement."""
-        if (read := settings.wire.measurement.unpack(frame)) is None:
+        if (read := wire.measurement.unpack(frame)) is None:
             return
         x, y, z = map(self._level, read[1][:3])
         if x == x and y == y and z == z:
@@ -219,6 +253,7 @@ class Feed:
                     at, last = vehicle.statuses.get(role, (now_s, status))
                     if replaces(status, last, now_s - at):
                         vehicle.statuses[role] = now_s, status
+                        vehicle.follow_descriptions()
                 case "telemetry":
                     vehicle.telemetry.append(Telemetry.model_validate_json(payload))
                 case "trace":

@@ -7,7 +7,6 @@ slow page has no queue. Without an operator's certificate where the network has 
 
 from __future__ import annotations
 
-import json
 import logging
 import secrets
 import ssl
@@ -30,11 +29,12 @@ from websockets.sync.server import ServerConnection, serve
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.printable import printable
 from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.network import joined_session
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.console.feed import SHOWN, Feed, Vehicle
-from aeroloop.service.console.verbs import Verbs
+from aeroloop.service.console.verbs import PageRequest, VerbError, Verbs
 from aeroloop.service.host.health import troubles
 from aeroloop.service.report.page import rendered
 
@@ -90,13 +90,17 @@ class Console:
         self.url = f"{self.origin}/?token={self._token}"
 
     def run(self, stop: Event) -> None:
-        """Serve until `stop` is set."""
+        """Serve until `stop` is set, or an exception ends it: a Python process with an open session would not end."""
         Thread(target=self._server.serve_forever, daemon=True).start()
-        while not stop.wait(BLOCK_S):
-            for one in self._descriptions.take():
-                self._feed.take(one.key, one.payload, time.monotonic(), one.published_ns * 1e-9)
-        self._server.shutdown()
-        self._session.__exit__(None, None, None)
+        try:
+            while not stop.wait(BLOCK_S):
+                for one in self._descriptions.take():
+                    self._feed.take(one.key, one.payload, time.monotonic(), one.published_ns * 1e-9)
+        finally:
+            try:
+                self._server.shutdown()
+            finally:
+                self._session.__exit__(None, None, None)
 
     def _receive(self, sample: zenoh.Sample) -> None:
         self._feed.take(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic(), time.time())
@@ -142,16 +146,16 @@ class Console:
         with suppress(ConnectionClosed, OSError):
             for text in socket:
                 try:
-                    asked = json.loads(text)
-                    verb = str(asked["verb"])
-                except (ValueError, KeyError, TypeError):
-                    continue  # of no page of ours
-                if verb == "shown":
+                    asked = PageRequest.read(text)
+                except VerbError as error:
+                    _send(socket, {"type": "answer", "number": None, "verb": "", "failed": str(error)})
+                    continue
+                if asked.verb == "shown":
                     shown.set()
-                elif verb == "stop":
-                    Thread(target=self._answer, args=(socket, verb, asked), daemon=True).start()
+                elif asked.verb == "stop":
+                    Thread(target=self._answer, args=(socket, asked), daemon=True).start()
                 else:
-                    self._answer(socket, verb, asked)
+                    self._answer(socket, asked)
         shown.set()
 
     def _stream(self, socket: ServerConnection, name: str, shown: Event) -> None:
@@ -173,15 +177,15 @@ class Console:
                 time.sleep(BLOCK_S)
                 shown.wait()
 
-    def _answer(self, socket: ServerConnection, verb: str, asked: dict[str, Any]) -> None:
+    def _answer(self, socket: ServerConnection, asked: PageRequest) -> None:
         """Do what a page asks for, and send what came of it."""
-        answer: dict[str, Any] = {"type": "answer", "number": asked.get("number"), "verb": verb}
+        answer: dict[str, Any] = {"type": "answer", "number": asked.number, "verb": asked.verb}
         try:
-            if self.reads_only and verb != "preview":
+            if self.reads_only and asked.verb != "preview":
                 raise ConsoleError("this console only reads: it has no operator's certificate")
-            answer |= self._verbs.do(verb, asked)
-        except (AeroloopError, ValueError, KeyError, TypeError, IndexError) as error:
-            answer |= {"failed": str(error)}
+            answer |= self._verbs.do(asked)
+        except (AeroloopError, ValueError, ArithmeticError, zenoh.ZError) as error:
+            answer |= {"failed": printable(str(error))}
         with suppress(ConnectionClosed, OSError):
             _send(socket, answer)
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from math import degrees
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Gains, Hold, Inject, Mark, Message, Request, Sinusoid, Track
+from aeroloop.protocol.messages.operator import Angles, Gains, Hold, Inject, Mark, Message, Request, Sinusoid, Track
+from aeroloop.protocol.messages.topics import NAME
 from aeroloop.protocol.transport.network import CommandSession
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import to_euler
@@ -24,6 +24,28 @@ from aeroloop.service.host.operator import send_by, stop, stop_by
 POINTS = 60  # of an approach that is previewed
 
 
+class PageRequest(BaseModel, frozen=True, extra="forbid"):
+    """What a page sends by its socket; of the fields after `vehicle` those of its verb count."""
+
+    verb: Literal["shown", "stop", "preview", "arm", "release", "mark", "goto", "track", "gains", "inject"]
+    number: int = Field(default=0, ge=0, le=2**53, description="the answer repeats it")
+    vehicle: str = Field(default="", pattern=f"^({NAME})?$", description="empty: every vehicle, of a stop")
+    attitude: Angles | None = Field(default=None, description="roll, pitch, yaw [deg]")
+    within_s: float | None = None
+    what: Literal["configured", "sinusoid", "hold"] = "configured"
+    gains: dict[str, list[float]] = {}
+    fault: str = ""
+    text: str = ""
+
+    @classmethod
+    def read(cls, text: str | bytes) -> PageRequest:
+        """Read what a page has sent. Raises VerbError, with one line, for what no page of ours sends."""
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as error:
+            raise VerbError(f"not a request of this page: {problem(error, cls)}") from None
+
+
 class VerbError(AeroloopError):
     """A request that no role could be asked; one line."""
 
@@ -34,15 +56,14 @@ class Verbs:
     def __init__(self, network: NetworkSettings, here: CommandSession, feed: Feed) -> None:
         self._network, self._here, self._feed = network, here, feed
 
-    def do(self, verb: str, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a verb; returns what a page is to show of it."""
-        vehicle = str(asked.get("vehicle") or "")
-        if verb == "stop":
-            return self._stop(vehicle or "*")
-        if verb == "preview":
-            return self._preview(vehicle, _angles(asked))
-        topic, message = _request(verb, asked)
-        return {"text": send_by(self._here.anew(), self._network, vehicle, topic, message)}
+    def do(self, asked: PageRequest) -> dict[str, Any]:
+        """Do what is asked for; returns what a page is to show of it."""
+        if asked.verb == "stop":
+            return self._stop(asked.vehicle or "*")
+        if asked.verb == "preview":
+            return self._preview(asked.vehicle, _attitude_of(asked))
+        topic, message = _request(asked)
+        return {"text": send_by(self._here.anew(), self._network, asked.vehicle, topic, message)}
 
     def _stop(self, vehicle: str) -> dict[str, Any]:
         """What each plant answered; where one does not, all are asked again, by a new session and for longer."""
@@ -78,34 +99,32 @@ class Verbs:
         }
 
 
-def _request(verb: str, asked: Mapping[str, Any]) -> tuple[str, Message]:
-    """Topic and message of a verb; raises VerbError for what is no verb or has wrong values."""
+def _request(asked: PageRequest) -> tuple[str, Message]:
+    """Topic and message of a verb. Raises VerbError for values that are none."""
     try:
-        match verb:
+        match asked.verb:
             case "arm":
                 return "arm", Request()
             case "release":
                 return "stand_down", Request()
             case "mark":
-                return "mark", Mark(text=str(asked.get("text", "")))
+                return "mark", Mark(text=asked.text)
             case "goto":
-                within = asked.get("within_s")
-                return "track", Track(reference=Hold(attitude=_angles(asked)), within_s=within)
+                return "track", Track(reference=Hold(attitude=_attitude_of(asked)), within_s=asked.within_s)
             case "track":
                 kinds = {"configured": None, "sinusoid": Sinusoid(), "hold": Hold()}
-                return "track", Track(reference=kinds[str(asked.get("what"))], within_s=asked.get("within_s"))
+                return "track", Track(reference=kinds[asked.what], within_s=asked.within_s)
             case "gains":
-                return "set_gains", Gains.model_validate(asked.get("gains"))
+                return "set_gains", Gains.model_validate(asked.gains)
             case "inject":
-                faults = [str(Fault.parse(str(asked["fault"])))] if asked.get("fault") else []
+                faults = [str(Fault.parse(asked.fault))] if asked.fault else []
                 return "inject", Inject(faults=faults, clear=not faults)
     except ValidationError as error:
         raise VerbError(problem(error)) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise VerbError(f"{verb} cannot be asked so: {error}") from None
-    raise VerbError(f"no verb {verb!r}")
+    raise VerbError(f"{asked.verb} asks for nothing")
 
 
-def _angles(asked: Mapping[str, Any]) -> tuple[float, float, float]:
-    roll, pitch, yaw = (float(asked["attitude"][i]) for i in range(3))
-    return roll, pitch, yaw
+def _attitude_of(asked: PageRequest) -> tuple[float, float, float]:
+    if asked.attitude is None:
+        raise VerbError(f"{asked.verb} needs an attitude: roll, pitch, yaw [deg]")
+    return asked.attitude

@@ -56,7 +56,7 @@ class ClaimClient:
             carrier,
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
-            lengths=self._wire.lengths("measurement", lockstep=self._loop.lockstep),
+            accepts=self._wire.acceptance("measurement", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
             depth=depth,
         )

@@ -14,14 +14,13 @@ from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, MessageError, Request, in_words
 from aeroloop.protocol.messages.states import ControllerState as State
 from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
-from aeroloop.protocol.messages.trace import batches_per_s
 from aeroloop.protocol.runtime.node import ASKED_BY, Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
 from aeroloop.service.daemon.claim import ANSWER_WAIT_S, SessionLostError
-from aeroloop.service.daemon.session import TELEMETRY_HZ, Session, Shared
+from aeroloop.service.daemon.session import Session, Shared
 
 STATUS_PERIOD_S: Final = 1.0
 CLAIM_PERIOD_S: Final = 0.25
@@ -46,8 +45,8 @@ class Daemon:
         role, loop, machine, own = self._role, self._settings.loop, self._shared.machine, self._settings.controller
         if not loop.lockstep:
             self._notes = prepare_process(loop)
-        role.declare("telemetry", TELEMETRY_HZ)
-        role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
+        role.declare("telemetry")
+        role.declare("trace", lossless=loop.lockstep)
         self._shared.changes.serve()
         role.serve("stand_down", Request, lambda _: self._stand_down)
         role.serve("recall", Request, lambda _: self._recall)
@@ -159,7 +158,7 @@ class Daemon:
         self._role.status(Status(
             role=self._role.role, state=state, session=shared.claims.session,
             cause=shared.cause if state is State.FAULTED else None, uptime_s=self._role.uptime_s,
-            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / (now - self._status_time_s),
+            ticks=counts.ticks, rate_hz=(counts.ticks - self._status_ticks) / max(now - self._status_time_s, 1e-3),
             skipped=counts.skipped, received=counts.received, sent=counts.sent, refused=refused, stale=counts.stale,
             saturated=counts.saturated + (session.controller.saturated if session else 0),
             age_us=shared.age.recent(), timing=shared.timing.report() if shared.timing else None,

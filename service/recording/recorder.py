@@ -69,7 +69,14 @@ class Recorder:
             self._end()
 
     def _end(self) -> None:
-        """Take what caches hold for at most `END_S`, name what is lost, and close the log with the last status."""
+        """Take what caches hold, name what is lost, and close the log, whatever fails before that."""
+        try:
+            self._take_the_rest()
+        finally:
+            self.log.close(len(self._waiting))
+
+    def _take_the_rest(self) -> None:
+        """Take what caches hold for at most `END_S`, name what is lost, and publish the last status."""
         self.log.tend(at_once=True)
         begun = time.monotonic()
         while not (self._complete(begun) or self.log.trouble or time.monotonic() > begun + END_S):
@@ -86,7 +93,6 @@ class Recorder:
         self._publish_losses(losses)
         self._publish_status()
         self._work(at_last=True)
-        self.log.close(len(self._waiting))
 
     # ── messages ──
 

@@ -345,7 +345,8 @@ class RollingLog:
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file's metadata name this run or, if runs are named by the time, any run so named."""
-        with suppress(OSError, McapError, struct.error, ValueError, KeyError, TypeError), path.open("rb") as file:
+        foreign = (OSError, McapError, struct.error, ValueError, KeyError, TypeError, RecursionError)
+        with suppress(*foreign), path.open("rb") as file:
             _, head = islice(StreamReader(file, record_size_limit=1 << 20).records, 2)
             if isinstance(head, Metadata) and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])

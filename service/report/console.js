@@ -13,6 +13,7 @@ let socket = null;
 let session = ""; // of the columns
 let statuses = {}; // by vehicle and role, as received
 let received = performance.now(); // the last block [ms]
+let measured = performance.now(); // the last rows were received [ms]
 let drawnAt = 0; // the plots were [ms]
 let asked = 0; // requests so far
 
@@ -28,6 +29,7 @@ function append(block) {
     for (const line of lines) line.y.length = 0;
     eventLines = [];
   }
+  if (block.rows?.length) measured = performance.now();
   for (const [time, ...values] of block.rows ?? []) {
     instants.push(time);
     lines.forEach((line, i) => line.y.push(values[i] ?? NaN));
@@ -70,13 +72,29 @@ function showStatuses() {
   roles.replaceChildren(...rows);
   const own = statuses[vehicle] ?? {};
   const gone = socket?.readyState !== WebSocket.OPEN || since > 2;
-  find("state").textContent = own.plant?.state ?? "no plant";
+  find("state").textContent = headline(own.plant, since);
+  showAge((performance.now() - measured) / 1000);
   find("link").textContent = gone ? `no link for ${since.toFixed(0)} s` : readsOnly ? "linked, reads only" : "linked";
   document.body.classList.toggle("gone", gone);
   find("instead").hidden = !gone;
   find("operate").disabled = gone || readsOnly;
   for (const button of document.querySelectorAll("button.stop")) button.disabled = gone || readsOnly;
   showGains(own.controller?.gains ?? {});
+}
+
+/** The plant's state; without a status for 3 s it may be another one by now. */
+function headline(plant, since) {
+  if (!plant) return "no plant";
+  const age = plant.age_s + since;
+  return age > 3 ? `silent for ${age.toFixed(0)} s, last ${plant.state}` : plant.state;
+}
+
+/** Say how old the newest attitude is: without a session, as after a trip, none is measured. */
+function showAge(age) {
+  const isOld = age > 2;
+  const stage = document.querySelector(".stage");
+  stage.classList.toggle("old", isOld);
+  stage.querySelector("th.number").textContent = isOld ? `last known, ${age.toFixed(0)} s ago` : "now";
 }
 
 function showGains(gains) {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import inf
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -87,6 +87,30 @@ def outline(values: Array, starts: Integers) -> Array:
     return np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
 
 
+class StatePanels(NamedTuple):
+    """How a part of the law's state is drawn."""
+
+    name: str
+    title: str
+    labels: list[str]  # of its elements
+    unit: str
+    columns: slice  # of all of the state's elements, those of this part
+
+
+def state_panels(settings: Settings) -> Iterator[StatePanels]:
+    """The parts of the law's state that are drawn: all but the sign of the equilibrium. Raises LawError."""
+    law = law_of(settings.law, settings.loop.period, settings.wire.actuators)
+    at = 0
+    for name, values in initial_state(law).items():
+        columns = slice(at, at + len(values))
+        at = columns.stop
+        if name != "sign":
+            symbol = {"damping_estimate": "θ̂"}.get(name, name)
+            labels = [f"{symbol}{'₁₂₃₄₅₆₇₈₉'[i] if i < 9 else i + 1}" for i in range(len(values))]
+            title = name.replace("_", " ").capitalize()
+            yield StatePanels(name, title, labels, law.units.get(name, "1"), columns)
+
+
 def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths: Truths) -> Iterator[_Quantity]:
     desired, error, found = ticks.desired, ticks.attitude_error, theorem.findings
 
@@ -117,14 +141,9 @@ def _quantities(settings: Settings, ticks: Ticks, theorem: TheoremCheck, truths:
     if not settings.loop.lockstep:
         yield "latency", "Loop latency", ["latency"], "ms", {"latency": ticks.latency_ns * 1e-6}
         yield "period", "Period between measurements", ["period"], "ms", {"period": periods_ns(ticks) * 1e-6}
-    law, at = law_of(settings.law, settings.loop.period, settings.wire.actuators), 0
-    for name, values in initial_state(law).items():
-        if name != "sign":  # of the equilibrium
-            symbol = {"damping_estimate": "θ̂"}.get(name, name)
-            labels = [f"{symbol}{'₁₂₃₄₅₆₇₈₉'[i] if i < 9 else i + 1}" for i in range(len(values))]
-            lines, unit = {"estimated": ticks.state[:, at : at + len(values)]}, law.units.get(name, "1")
-            yield name, name.replace("_", " ").capitalize(), labels, unit, lines
-        at += len(values)
+    for drawn in state_panels(settings):
+        lines = {"estimated": ticks.state[:, drawn.columns]}
+        yield drawn.name, drawn.title, drawn.labels, drawn.unit, lines
     if found.holds is not None and len(theorem.true_k):
         period, until = settings.loop.period, inf if found.until_s is None else found.until_s
         lines = {"true": true(0)}

@@ -13,7 +13,7 @@ from aeroloop.service.report import rows
 from aeroloop.service.report.rows import count, grave, missing
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Report, differences
 from aeroloop.service.review.requirements import FIGURES, value_of
-from aeroloop.service.terminal.show import Row, Sheets
+from aeroloop.service.terminal.show import Row, Sheets, paragraph
 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.trace import End
@@ -55,7 +55,7 @@ def figure_sheets(figures: Figures) -> Sheets:
     lines = [f"tripped: {trip}" for trip in figures.trips] + [f"not read: {line}" for line in figures.damages]
     lines += [f"log: {figures.log}"] if figures.log else []
     if lines:
-        yield "\n".join(lines), []
+        yield paragraph(lines), []
 
 
 def demo_sheets(figures: DemoFigures) -> Sheets:
@@ -109,7 +109,7 @@ def comparison_sheets(reports: Sequence[Report]) -> Sheets:
         trips = [f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"]
         lines += [f"{report.name}: {line}" for line in (*trips, *_some(missing(report.findings)))]
     if lines:
-        yield "\n".join(lines), []
+        yield paragraph(lines), []
 
 
 def _figure_rows(names: Sequence[str], runs: Sequence[Figures]) -> list[Row]:
@@ -216,7 +216,7 @@ def export_sheets(exported: Exported) -> Sheets:
     if others := exported.left_out:
         names = ", ".join(_some(others))
         lines.append(f"not exported of this log: {names}; choose by --vehicle and --session")
-    yield "\n".join([f"{exported.out}: {found}", *lines]), []
+    yield paragraph([f"{exported.out}: {found}", *lines]), []
 
 
 def replay_sheets(replay: Replay) -> Sheets:
@@ -233,7 +233,7 @@ def replay_sheets(replay: Replay) -> Sheets:
     named = {line for unseen in replay.unseen.values() for line in unseen}
     lines += [f"not read: {line}" for line in _some([line for line in replay.damages if line not in named])]
     lines += [f"not judged: {line}" for line in _some(replay.others)]
-    yield "\n".join(lines), []
+    yield paragraph(lines), []
 
 
 def instant_sheets(its: Instant) -> Sheets:
@@ -271,7 +271,7 @@ def instant_sheets(its: Instant) -> Sheets:
     clocks = [f"{name} at {'–' if at_s is None else f'{at_s:.6f} s'}" for name, at_s in its.clocks_s.items()]
     lines = [f"delays: {', '.join(known)}"] * bool(known) + clocks * any(its.clocks_s.values()) + its.notes
     if lines:
-        yield "\n".join(lines), []
+        yield paragraph(lines), []
     if its.events:
         yield "within a second", [_event(*each) for each in timed(its.events)[:SHOWN]]
 
@@ -303,7 +303,7 @@ def fork_sheets(fork: Fork, reports: Sequence[Report]) -> Sheets:
             lines.append(f"a frame was late or lost before, first at tick {fork.network}")
     elif fork.compared:
         lines.append(f"{fork.compared} ticks, every one the same, byte for byte")
-    yield "\n".join(lines + ([f"log: {fork.log}"] if fork.log else [])), []
+    yield paragraph(lines + ([f"log: {fork.log}"] if fork.log else [])), []
 
 
 def check_sheets(checked: Sequence[LogCheck]) -> Sheets:
@@ -328,7 +328,7 @@ def check_sheets(checked: Sequence[LogCheck]) -> Sheets:
         unseen = [f"not compared: {line}" for line in one.unseen]
         lines += [f"{Path(one.log).name}: {line}" for line in (*_some(unseen), *_some(one.notes))]
     if lines:
-        yield "\n".join(lines), []
+        yield paragraph(lines), []
 
 
 def _replayed(replay: Replay, name: End) -> str:

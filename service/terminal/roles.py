@@ -12,7 +12,7 @@ from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.protocol.transport.certificate import SOON_DAYS
 from aeroloop.service.host.health import NEEDED, SILENT_S, Trouble, lacking_recorder
 from aeroloop.service.host.operator import Gathered
-from aeroloop.service.terminal.show import Row, Sheets
+from aeroloop.service.terminal.show import Row, Sheets, paragraph
 
 
 def role_sheets(statuses: Mapping[str, Status], vehicle: str) -> Sheets:
@@ -43,7 +43,7 @@ def trouble_sheets(found: Gathered, wrong: Sequence[Trouble]) -> Sheets:
     for vehicle, roles in sorted(found.statuses.items()) if not lines else []:
         states = ", ".join(f"{role} {status.state}" for role, status in sorted(roles.items()))
         lines.append(f"{vehicle} is well: {states}")
-    yield "\n".join(lines), []
+    yield paragraph(lines), []
 
 
 def _row(role: str, status: Status | None) -> Row:

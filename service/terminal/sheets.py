@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from aeroloop.protocol.wire.quantizer import HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
-from aeroloop.service.terminal.show import Row, Sheets
+from aeroloop.service.terminal.show import Row, Sheets, paragraph
 
 if TYPE_CHECKING:
     from aeroloop.protocol.wire.spec import WireSpec
@@ -71,7 +71,7 @@ def wire_sheets(wire: WireSpec) -> Sheets:
     yield "", rows
     for label, frame in (("measurement", wire.measurement), ("command", wire.command)):
         notes.append(f"{label}: {frame.bits} bits in {frame.size} bytes, {frame.counter_bits} of them the counter")
-    yield "\n".join(notes), []
+    yield paragraph(notes), []
 
 
 def diagnosis_sheets(diagnosis: Diagnosis) -> Sheets:
@@ -102,4 +102,4 @@ def key_sheets(folder: str, files: Sequence[KeyFile]) -> Sheets:
         )
     yield folder, found
     if problems := [file.problem for file in files if file.problem]:
-        yield "\n".join(problems), []
+        yield paragraph(problems), []

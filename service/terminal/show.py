@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from aeroloop.protocol.printable import printable
 from aeroloop.protocol.wire.attitude import angle
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 Row: TypeAlias = dict[str, str]
 
 Sheets: TypeAlias = Iterable[tuple[str, Sequence[Row]]]
-"""Tables, each with its title, and paragraphs, which are titles without rows."""
+"""Tables, each with its title, and paragraphs, which are titles without rows; a title may have several lines."""
 
 STYLES: Final = {
     **dict.fromkeys(("✓", "running", "driven", "recording", "routing"), "green"),
@@ -37,6 +38,11 @@ STYLES: Final = {
 _PIPE_WIDTH: Final = 160
 _GAP: Final = 2
 _LINE_S: Final = 10.0
+
+
+def paragraph(lines: Iterable[str]) -> str:
+    """Lines as a paragraph. What of the network or a log is in one cannot look like another line."""
+    return "\n".join(map(printable, lines))
 
 
 def show(rows: Sequence[Row], title: str = "", keys: int = 1) -> None:
@@ -65,11 +71,19 @@ def markdown(sheets: Sheets) -> str:
 
 def drawn(rows: Sequence[Row], title: str, width: int, keys: int = 1) -> Group:
     """Rows as a table that is at most so wide: blocks of columns below each other where not all fit side by side."""
+    title, rows = _printable_sheet(title, rows)
     heading = [Text(title, style="bold" if rows else "")] if title else []
     return Group(*heading, *(_blocks(rows, width, keys) if rows else ()))
 
 
+def _printable_sheet(title: str, rows: Sequence[Row]) -> tuple[str, Sequence[Row]]:
+    """A title, of one line or several, and rows without any character that acts on a terminal."""
+    printable_rows = [{name: printable(cell) for name, cell in row.items()} for row in rows]
+    return paragraph(title.split("\n")), printable_rows
+
+
 def _markdown(rows: Sequence[Row], title: str) -> list[str]:
+    title, rows = _printable_sheet(title, rows)
     if not rows:
         return [title]
     heading = [f"**{title}**", ""] if title else []

@@ -16,6 +16,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
+from aeroloop.protocol.printable import printable
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
@@ -120,7 +121,7 @@ class HilLog:
         with suppress(Exception):  # whatever a broken log makes its reader raise
             timed = self.messages(Event)
             lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed] or lines
-        events.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        events.write_text("\n".join(map(printable, lines)) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:
             from aeroloop.service.report.page import page

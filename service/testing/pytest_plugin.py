@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from aeroloop.protocol.printable import printable
+
 if TYPE_CHECKING:
     from aeroloop.service.testing.hil import Hil
 
@@ -73,5 +75,5 @@ def pytest_runtest_makereport(
     """Add the evidence of a failed test's loop to its report, while the loop's folder is still there."""
     report = yield
     if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) and (lines := loop.evidence()):
-        report.sections.append(("hil", "\n".join(lines)))
+        report.sections.append(("hil", "\n".join(map(printable, lines))))
     return report

@@ -46,8 +46,12 @@ def test_a_frame_crosses_byte_for_byte_padded_with_zeros_and_no_other_length_or_
     wire: WireSpec, fd: bool, measurement: tuple[int, int], command: tuple[int, int]
 ) -> None:
     with both_ends(virtual(fd=fd), wire) as (plant, controller, stranger):
-        for sender, receiver, (size, length) in ((plant, controller, measurement), (controller, plant, command)):
-            for payload in (bytes(size), bytes(range(size)), b"\xff" * size):
+        for sender, receiver, layout, (size, length) in (
+            (plant, controller, wire.measurement, measurement),
+            (controller, plant, wire.command, command),
+        ):
+            codes = [(-1) ** i * (i + 1) for i in range(len(layout.widths))]
+            for payload in (bytes(size), layout.pack(1, codes), layout.pack(layout.counters - 1, codes[::-1])):
                 sender.send(payload)
                 seen = stranger.receive()
                 assert bytes(seen.data) == payload + bytes(length - size)
@@ -63,6 +67,15 @@ def test_a_frame_crosses_byte_for_byte_padded_with_zeros_and_no_other_length_or_
         stranger.settle(controller)
         assert controller.take() is None
         assert controller.refused == len(wrong) > 0
+
+
+def test_a_frame_that_cannot_be_read_is_refused_and_displaces_none() -> None:
+    with both_ends(virtual(), PAPER) as (plant, _, stranger):
+        good = PAPER.command.pack(7, (5, -5))
+        for data in (good, good[:-1] + bytes([good[-1] | 1])):  # a padding bit of the second is set
+            stranger.say(COMMAND_ID + 1, data)
+        eventually("the refusal", lambda: plant.refused == 1)
+        assert received(plant) == good
 
 
 def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specification() -> None:

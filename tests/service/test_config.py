@@ -31,6 +31,25 @@ KINDS: dict[str, tuple[Any, ...]] = {
 }
 
 
+@pytest.mark.parametrize("depth", [100, 500, 5_000])
+@pytest.mark.parametrize("opening", ["[", "{a="])
+def test_a_file_or_an_override_that_is_nested_too_deeply_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], depth: int, opening: str
+) -> None:
+    nested = opening * depth + "1" + {"[": "]", "{a=": "}"}[opening] * depth
+    file = tmp_path / "deep.toml"
+    texts = [f"x = {nested}", f"[plant.own]\nx = {nested}", f"[plant.own{'.a' * depth}]\nb = 1", "x = " + "[" * 5_000]
+    for text in texts:
+        file.write_text(text)
+        assert execute(["show", "config", "--config", str(file)]) == 2
+        assert capsys.readouterr().err.startswith(f"aeroloop: {file}: nested too deeply, more than 32 ")
+    for override in (f"plant.own.x={nested}", f"plant.own{'.a' * depth}=1"):
+        assert execute(["show", "config", "--set", override, "--set", override]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "nested too deeply" in line
+        assert len(line) < 200
+
+
 def test_every_key_is_described_and_a_quantity_has_a_unit() -> None:
     assert [key for key, field in KEYS.items() if not field.description] == []
     quantities = {key: field.description or "" for key, field in KEYS.items() if "float" in str(field.annotation)}

@@ -83,9 +83,10 @@ class Messages:
         self.all.append(Logged(START_NS + clock.now_ns, key, payload, clock.time_ns()))
 
 
-def description(settings: Settings, role: str) -> Description:
+def description(settings: Settings, role: str, **facts: str) -> Description:
+    config = settings.description()
     return Description(
-        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=settings.description()
+        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=config, facts=facts
     )
 
 

@@ -98,8 +98,8 @@ class Network:
 
 
 class LonelyNode(Node):
-    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
-        del per_s, lossless
+    def declare(self, topic: str, *, lossless: bool = False) -> None:
+        del lossless
         network: Any = self.zenoh
         key = topics.key(topic, self.vehicle, role=self.role)
         publisher: Any = SimpleNamespace(id=None, put=lambda payload: network.put.append((key, payload)))

@@ -12,23 +12,26 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.hosts import latch_file
+from aeroloop.plant_emulator.hosts import latch_file, zenoh_network
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile
 from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Grant, Status
-from aeroloop.protocol.messages.operator import Answer, Mark
+from aeroloop.protocol.messages.models import Event, Grant, Release, Status
+from aeroloop.protocol.messages.operator import Answer, Mark, Message
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.runtime import node
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
 from aeroloop.protocol.wire.spec import LoopSettings
-from tests.support.plant_end import WIRE, Asker
+from tests.support.plant_end import WIRE, Asker, claim_of
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 LOOP = LoopSettings(realtime="off", rate_hz=100)  # slow, so that a busy machine keeps up
@@ -91,6 +94,49 @@ def test_its_last_record_is_shown_without_its_loop() -> None:
 
         eventually("an answer", ask)
         assert Answer.decode(answers[0]).text == "aero has no record of a session"
+
+
+def test_a_release_and_a_claim_between_the_same_two_ticks_leave_one_link_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a network: five pairs of requests left six links."""
+    session, open_links = MagicMock(), list[object]()
+    session.declare_subscriber.return_value.try_recv.return_value = None
+
+    class CountedLink:
+        refused = 1
+
+        def __init__(self, *_: object, **__: object) -> None:
+            open_links.append(self)
+
+        def close(self) -> None:
+            open_links.remove(self)
+
+    monkeypatch.setattr(node, "join", lambda *_: session)
+    monkeypatch.setattr(zenoh_network, "ZenohLink", CountedLink)
+    role = Node("controller", "aero", NetworkSettings(), {})  # as a plant it would look for another one
+    endpoint = PLANT.endpoint(PLANT.make(LOOP.period), LOOP, WIRE)
+    network = ZenohNetwork(role, LOOP, endpoint, PLANT)
+    network.serve()
+    topics_served = {call.args[0]: call.args[1] for call in session.declare_queryable.call_args_list}
+
+    def request(topic: str, message: Message) -> None:
+        key = topics.key(topic, "aero")
+        payload = SimpleNamespace(to_bytes=message.encode)
+        topics_served[key](MagicMock(key_expr=key, payload=payload, attachment=None))
+
+    request("claim", claim_of("c", period_ns=LOOP.period_ns, session="s0"))
+    network.take_inbox()
+    for i in range(5):
+        request("release", Release(session=f"s{i}"))
+        request("claim", claim_of("c", period_ns=LOOP.period_ns, session=f"s{i + 1}"))
+        network.take_inbox()
+        assert endpoint.session == f"s{i + 1}"
+    assert open_links == [network.link]
+    request("release", Release(session="s5"))
+    network.take_inbox()
+    assert open_links == []
+    published = session.declare_publisher.return_value.put.call_args_list
+    statuses = [call.args[0] for call in published if b'"refused":' in call.args[0]]
+    assert Status.model_validate_json(statuses[-1]).refused == 6  # of all six links
 
 
 # ── the latch's file ──

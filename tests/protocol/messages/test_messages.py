@@ -213,6 +213,12 @@ def test_a_topic_s_kind_says_what_else_it_has(topic: Topic) -> None:
         assert ("{role}" in topic.key) == (len(topic.senders) > 1)
 
 
+@pytest.mark.parametrize("more", ["/x", "x", "\n", "/@cache"])
+def test_a_key_with_something_after_it_is_another_key(more: str) -> None:
+    assert read_key("aeroloop/aero/telemetry") is not None
+    assert read_key(f"aeroloop/aero/telemetry{more}") is None
+
+
 @given(st.text(max_size=40))
 def test_reading_a_key_never_raises_and_never_invents_a_topic(text: str) -> None:
     assert read_key(text) is None

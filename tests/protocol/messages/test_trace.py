@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aeroloop import protocol
-from aeroloop.protocol.messages.operator import Change, Gains
+from aeroloop.protocol.messages.operator import Change, Gains, Hold
 from aeroloop.protocol.messages.trace import (
     MAX_ROWS,
     NEVER,
@@ -171,3 +171,17 @@ def test_a_batch_of_more_rows_than_one_may_have_is_refused() -> None:
         for k in range(rows):
             writer.row(ROW._replace(tick=k))
         assert (read_batch(writer.take(11 * S, S)) is not None) == (rows == MAX_ROWS)
+
+
+def test_a_record_is_of_the_session_that_runs_and_of_none_before_it() -> None:
+    """The changes of a session begin with all that holds; of an earlier one nothing does."""
+    writer, gains = TraceWriter("controller", WIRE, 1), Gains(C1=None, C2=(0.2, 0.2, 0.2), Gamma=None)
+    for i, change in enumerate(
+        (Change(session="a", tick=0, gains=gains, reference=Hold()), Change(session="b", tick=0))
+    ):
+        writer.session = change.session
+        writer.changes.append(change)
+        writer.take(10 * i * S, 0)
+        batch = read_batch(writer.take((10 * i + 5) * S, 0))
+        assert batch is not None
+        assert {each.session for each in batch.tail.record} == ({"a"} if change.session == "a" else set())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import zenoh
@@ -16,6 +17,8 @@ from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.transport.link import Link, Mailbox, ZenohLink
 from aeroloop.protocol.transport.network import FrameSession
 from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings, SecuritySettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
@@ -57,12 +60,16 @@ def pair() -> Iterator[Sessions]:
         yield a, b
 
 
+def any_frame(_: bytes) -> bool:
+    return True
+
+
 def links(
-    pair: Sessions, session: str = "s1", *, lossless: bool = True, lengths: Container[int] = range(256)
+    pair: Sessions, session: str = "s1", *, lossless: bool = True, accepts: Callable[[bytes], bool] = any_frame
 ) -> tuple[ZenohLink, ZenohLink]:
     """Both ends of a link, connected in both directions. Lossless, so that a slow machine drops nothing."""
-    plant = ZenohLink(pair[0], f"t/{session}/measurement", f"t/{session}/command", lengths, lossless=lossless)
-    controller = ZenohLink(pair[1], f"t/{session}/command", f"t/{session}/measurement", lengths, lossless=lossless)
+    plant = ZenohLink(pair[0], f"t/{session}/measurement", f"t/{session}/command", accepts, lossless=lossless)
+    controller = ZenohLink(pair[1], f"t/{session}/command", f"t/{session}/measurement", accepts, lossless=lossless)
     for sender, receiver in ((plant, controller), (controller, plant)):  # a put right after a subscription may be lost
 
         def received(sender: Link = sender, receiver: Link = receiver) -> bool:
@@ -76,10 +83,10 @@ def links(
 
 
 @pytest.mark.parametrize("lossless", [True, False])
-def test_frames_arrive_both_ways_as_they_were_sent_and_a_wrong_length_displaces_none(
+def test_frames_arrive_both_ways_as_they_were_sent_and_what_is_not_accepted_displaces_none(
     pair: Sessions, lossless: bool
 ) -> None:
-    plant, controller = links(pair, lossless=lossless, lengths={5, 0})
+    plant, controller = links(pair, lossless=lossless, accepts=lambda frame: len(frame) in (5, 0))
     for sender, receiver in ((plant, controller), (controller, plant)) * 20:
         for frame in (b"good!", b""):
             before, refused = time.monotonic_ns(), receiver.refused
@@ -92,6 +99,39 @@ def test_frames_arrive_both_ways_as_they_were_sent_and_a_wrong_length_displaces_
             if lossless:
                 eventually("the refusals", lambda r=receiver, n=refused: r.refused == n + 3)  # type: ignore[misc]
             assert receiver.take() is None
+
+
+def test_in_real_time_no_frame_that_cannot_be_read_displaces_one_that_can(pair: Sessions) -> None:
+    """Junk of the right length in the place of commands, 1 000 a second, tripped the plant in 6 s."""
+    wire = WireSpec()
+    good = wire.command.pack(7, (5, -5))
+    junk = good[:-1] + bytes([good[-1] | 1])  # a padding bit is set
+    accepts = {lockstep: wire.acceptance("command", lockstep=lockstep) for lockstep in (False, True)}
+    assert len(junk) == len(good)
+    assert accepts[True](junk)  # it counts as the answer that was due
+    plant = ZenohLink(pair[0], "t/s1/measurement", "t/s1/command", accepts[False])
+    controller = ZenohLink(pair[1], "t/s1/command", "t/s1/measurement", any_frame, lossless=True)
+
+    def received() -> bool:
+        controller.send(good)
+        return receive(plant, 0.05) == good
+
+    eventually("the first frame", received)
+    for frame in (junk, good, junk, junk):
+        controller.send(frame)
+    eventually("the refusals", lambda: plant.refused == 3)
+    assert receive(plant) == good
+    assert plant.take() is None
+
+
+@pytest.mark.parametrize("direction", ["measurement", "command"])
+@pytest.mark.parametrize("policy", ["periodic", "on_change"])
+def test_an_empty_frame_is_accepted_in_lockstep_on_change_alone(
+    direction: Literal["measurement", "command"], policy: Policy
+) -> None:
+    wire = WireSpec(transmit=Transmit.model_validate({direction: policy}))
+    accepted = {lockstep: wire.acceptance(direction, lockstep=lockstep)(UNCHANGED) for lockstep in (False, True)}
+    assert accepted == {False: False, True: policy == "on_change"}
 
 
 def test_a_link_receives_only_its_own_session_and_nothing_once_it_is_closed(pair: Sessions) -> None:
@@ -145,10 +185,10 @@ def frame_sessions(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[t
 def test_a_plant_takes_and_sends_frames_on_either_session(frame_sessions: tuple[FrameSession, FrameSession]) -> None:
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
-        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), also=frame_sessions[0].session)
+        plant = ZenohLink(main, MEASUREMENT, COMMAND, any_frame, also=frame_sessions[0].session)
         for session in (other, frame_sessions[1].session):
             assert session is not None
-            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256))
+            controller = ZenohLink(session, COMMAND, MEASUREMENT, any_frame)
 
             def there_and_back(link: ZenohLink = controller) -> bool:
                 link.send(b"command")

@@ -97,7 +97,7 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
     router = route(settings, ROUTER)
     speaker = open_sessions.enter_context(closing(join(settings, SPEAKER)))
     listener = open_sessions.enter_context(closing(join(settings)))
-    publisher, subscriber = CachedPublisher(speaker, WORD, 10.0), RecoveringSubscriber(listener, WORD)
+    publisher, subscriber = CachedPublisher(speaker, WORD), RecoveringSubscriber(listener, WORD)
     tokens: list[zenoh.SampleKind] = []
     seen = listener.liveliness().declare_subscriber(ALIVE, lambda token: tokens.append(token.kind), history=True)
     token = speaker.liveliness().declare_token(ALIVE)

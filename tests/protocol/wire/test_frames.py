@@ -68,6 +68,7 @@ def test_any_bytes_are_refused_or_are_exactly_what_packing_gives(form: FrameForm
         bits = "".join("0" if part == "." else bit for bit, part in zip(bits, laid_out, strict=True))
         frame = as_bytes(bits)
     arrived = form.unpack(frame)
+    assert form.is_well_formed(frame) == (arrived is not None)
     assert form.counter(frame) == (None if arrived is None else arrived[0])
     if len(frame) != size or any(bit == "1" and part == "." for bit, part in zip(bits, laid_out, strict=True)):
         assert arrived is None
@@ -78,6 +79,7 @@ def test_any_bytes_are_refused_or_are_exactly_what_packing_gives(form: FrameForm
     if None in form.widths:
         infinite = [inf if width is None else 0 for width in form.widths]
         assert form.unpack(as_bytes(bit_string(form, 0, infinite))) is None
+        assert not form.is_well_formed(as_bytes(bit_string(form, 0, infinite)))
 
 
 @pytest.mark.parametrize("bits", [4, 8, 16])

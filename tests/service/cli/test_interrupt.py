@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.processes import AEROLOOP, sessions
 from tests.support.zenoh_network import eventually
 
@@ -91,6 +92,48 @@ def test_a_daemon_that_is_terminated_just_as_it_begins_to_wait_ends() -> None:
     finally:
         process.kill()
         process.communicate()
+
+
+WITH_A_DEFECT = """
+import sys
+from {module} import {owner}
+from aeroloop.service.cli.entry import main
+
+def defect(*_, **__):
+    raise RuntimeError("a defect")
+
+{owner}.{method} = defect
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("verb", "module", "owner", "method"),
+    [
+        ("recorder", "aeroloop.protocol.transport.history", "RecoveringSubscriber", "take"),
+        ("op console --port 0", "aeroloop.protocol.transport.history", "RecoveringSubscriber", "take"),
+        ("log live --port 0", "aeroloop.protocol.transport.history", "RecoveringSubscriber", "take"),
+        ("controller", "aeroloop.service.daemon.claim", "ClaimClient", "claim"),
+        ("plant", "aeroloop.plant_emulator.hosts.zenoh_network", "ZenohNetwork", "take_inbox"),
+        ("router", "aeroloop.protocol.runtime.node", "Node", "status"),
+    ],
+)
+def test_an_exception_that_nobody_foresaw_ends_a_process_with_one_line_and_exit_code_1(
+    tmp_path: Path, verb: str, module: str, owner: str, method: str
+) -> None:
+    """With its session: a Python process with an open one does not end, and did not heed SIGTERM either."""
+    code = WITH_A_DEFECT.format(module=module, owner=owner, method=method)
+    words = [*verb.split(), "--set", f"network.rendezvous={free_rendezvous()}"]
+    if verb == "recorder":
+        words += ["--log", str(tmp_path)]
+    process = start(sys.executable, "-P", "-c", code, *words)
+    try:
+        _, said = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert said.splitlines()[-1] == "aeroloop: unexpected RuntimeError: a defect; `aeroloop --debug …` shows where"
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import accumulate
-from math import acos, degrees, hypot, radians
+from math import acos, cos, degrees, hypot, radians, sin
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.models import SessionRecord
+from aeroloop.protocol.messages.models import Grant, SessionRecord
 from aeroloop.protocol.messages.operator import (
     MAX_POINTS,
     Change,
@@ -30,8 +30,9 @@ from aeroloop.protocol.messages.operator import (
     Track,
 )
 from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.attitude import IDENTITY, distance
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.control.reference import Trajectory
+from aeroloop.service.control.reference import Limits, Trajectory
 from aeroloop.service.daemon.operator_changes import rest_of_reference
 from aeroloop.service.settings import ControllerSettings
 from tests.support.numpy_twin import attitude_of
@@ -47,7 +48,7 @@ from tests.support.operated_loop import (
     measured,
     turned,
 )
-from tests.support.plant_end import GAINS, record_of
+from tests.support.plant_end import GAINS, claim_of, claimed, record_of
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
 LATER_TOO_FAST = Points(
@@ -116,6 +117,7 @@ def test_what_is_refused_is_answered_with_the_reason_and_changes_nothing(
 
 def test_without_a_session_there_is_nothing_to_change(loop: Loop) -> None:
     loop.end()
+    assert loop.live.record.session is None
     before = list(loop.network.put)
     asked = loop.ask("track", Track(reference=yaw_of(30.0)))
     loop.role.take_inbox()
@@ -535,6 +537,45 @@ def test_points_go_on_with_the_first_that_was_not_reached(
         assert left.attitudes == points.attitudes[ahead[0] :]
         assert left.interpolation == points.interpolation
         assert left.times == pytest.approx([times[i] - times[ahead[0]] for i in ahead])
+
+
+def test_a_body_found_beyond_the_limit_of_tilt_is_brought_back_whatever_the_tilt_on_the_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An operator's reference may tilt by 60°. From a roll of 170° and a pitch of 80° the way back tilts even more."""
+    monkeypatch.setattr(Limits, "of", lambda *_: Limits(rate=1.0, tilt=radians(60.0), rolls=True))
+    loop = of("configured", LEVEL)
+    loop.begin()
+    roll, pitch = radians(170.0) / 2, radians(80.0) / 2
+    found = [sin(roll) * cos(pitch), cos(roll) * sin(pitch), -sin(roll) * sin(pitch)]
+    for _ in range(5_000):
+        loop.tick([*found, 0.0, 0.0, 0.0])
+    (text,) = loop.events("changed")
+    assert "away from its reference: approaches" in text
+    assert distance(loop.controller.desired, IDENTITY) < 1e-6
+    loop.assert_it_runs_again()
+
+
+@pytest.mark.parametrize(
+    ("stopped", "ended", "source"), [(False, "released", "resumed"), (True, TripCause.OPERATOR, "held")]
+)
+def test_a_session_that_was_released_is_resumed_unless_an_operator_stopped_the_plant_since(
+    stopped: bool, ended: str, source: str
+) -> None:
+    """By the plant's own record; the next claim is granted after an `op arm`."""
+    endpoint, _ = claimed()
+    assert endpoint.keep(record_of("a", reference=TARGET))
+    endpoint.release("of-a")
+    if stopped:
+        endpoint.stop()
+        endpoint.arm()
+    grant = endpoint.claim(claim_of("b"))
+    assert isinstance(grant, Grant)
+    assert grant.last is not None
+    assert grant.last.ended == ended
+    loop = of("resume")
+    loop.begin(grant.last)
+    assert loop.live.record.reference_from == source
 
 
 def test_configured_follows_the_configuration_at_first_and_then_what_the_last_session_followed() -> None:

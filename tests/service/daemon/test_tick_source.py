@@ -179,3 +179,11 @@ def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_
     assert all(each.late_ns <= 100_000_000 for each in taken if each.received_as is Received.FRAME)
     assert source.ticks == [k for k in range(300) if k not in stale]
     assert set(stale) <= set(held)
+
+
+def test_a_malformed_frame_where_silence_is_allowed_is_no_tick_and_costs_none() -> None:
+    source = Source([arrival(0), arrival(1, content=b"junk"), arrival(2)])
+    source.run(until(3))
+    assert source.ticks == [0, 1, 2, 3]
+    (junk,) = (tick for tick, _ in source.taken if tick.received_as is Received.MALFORMED)
+    assert (junk.tick, junk.missed, junk.fresh) == (0, 0, False)

@@ -11,22 +11,24 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
 import zenoh
+from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport import history
-from aeroloop.protocol.transport.history import CachedPublisher, attachment
+from aeroloop.protocol.transport.history import CachedPublisher, Delivery, RecoveringSubscriber, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.recorder import Recorder
-from aeroloop.service.recording.rolling import RecorderError, parts
+from aeroloop.service.recording.rolling import parts
 from aeroloop.service.settings import RecorderSettings
 from tests.support.edited_log import by_mcap, contents
 from tests.support.made_log import description, made
@@ -42,7 +44,7 @@ class Running:
 
     def __init__(self, path: Path, network: NetworkSettings) -> None:
         self.path, self.full = path, False
-        self.error: RecorderError | None = None
+        self.error: Exception | None = None
         self.role = Node("recorder", "aero", network, {})
         self.recorder = Recorder(self.role, RecorderSettings(path=path))
         self._write = os.pwrite
@@ -52,7 +54,7 @@ class Running:
     def _run(self) -> None:
         try:
             self.recorder.run()
-        except RecorderError as error:
+        except Exception as error:
             self.error = error
 
     def write(self, fd: int, data: memoryview, offset: int) -> int:
@@ -127,11 +129,11 @@ def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch
 
 
 class Publisher:
-    """Publishes messages from a cache of 65 000."""
+    """Publishes messages, and keeps those of the last minute."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.count = 0
-        self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
+        self._publisher = CachedPublisher(session, KEY, lossless=True)
 
     def send(self, until: int, size: int = 1) -> None:
         for _ in range(self.count, until):
@@ -169,7 +171,7 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
 
     def publish(key: str, payload: bytes) -> None:
         if key not in publishers:
-            publishers[key] = CachedPublisher(session, key, per_s=50)
+            publishers[key] = CachedPublisher(session, key)
         publishers[key].put(payload)
         published.setdefault(key, []).append(payload)
 
@@ -207,7 +209,7 @@ def test_the_last_message_in_a_log_is_that_recording_stopped_and_traces_that_can
     """It cannot know whether their publishers have ended or its cable is out."""
     monkeypatch.setattr(history, "ANSWER_S", 0.1)
     session = gathering.join()
-    published, running = CachedPublisher(session, TRACE, per_s=10), record()
+    published, running = CachedPublisher(session, TRACE), record()
     published.put(b"")
     running.await_written()
     session.close()
@@ -230,7 +232,7 @@ def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and
 ) -> None:
     running, session = record(), gathering.join()
     names = [topics.key(name, "aero", role="plant") for name in topics.RECORDED if name != "description"]
-    publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
+    publishers = [CachedPublisher(session, key) for key in names]  # as long as they live, so do their caches
     for publisher in publishers:
         publisher.put(b"\xff\x00")
     settings = {number: load(None, [f"loop.rate_hz={rate_hz}"]) for number, rate_hz in ((1, 200), (0, 100))}
@@ -242,6 +244,25 @@ def test_no_description_and_one_older_than_the_last_are_recorded_as_they_are_and
     assert b'"rate_hz":200.0' in descriptions(running.path)[DESCRIPTION]
 
 
+def test_a_recorder_that_fails_closes_its_log_with_an_index(
+    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: RecoveringSubscriber) -> list[Delivery]:
+        raise RuntimeError("a defect")
+
+    running = record()
+    publisher.send(1)
+    running.await_written()
+    monkeypatch.setattr(RecoveringSubscriber, "take", fail)
+    eventually("the failure", lambda: running.error is not None)
+    assert str(running.error) == "a defect"
+    with running.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count >= 3
+
+
 # ── what is lost ──
 
 
@@ -250,7 +271,9 @@ def test_a_full_disk_is_reported_and_what_its_cache_holds_no_longer_is_counted_i
 ) -> None:
     """Every message is in the log or in the count of those that are not; none is in both, and none is lost twice."""
     monkeypatch.setattr(history, "WAITING_BYTES", 50 * 201)
-    short = CachedPublisher(gathering.join(), KEY.replace("aero/", "beta/"), per_s=1, lossless=True)  # of 65 messages
+    monkeypatch.setattr(history, "LEAST_KEPT", 65)
+    hours = count(step=2 * history.KEPT_S)  # each message is too old to be kept once the next is published
+    short = CachedPublisher(gathering.join(), KEY.replace("aero/", "beta/"), lossless=True, clock=lambda: next(hours))
     running, reported = record(), list[Status]()
     gathering.join().declare_subscriber(
         OWN_STATUS, lambda sample: reported.append(Status.model_validate_json(sample.payload.to_bytes()))
@@ -271,6 +294,22 @@ def test_a_full_disk_is_reported_and_what_its_cache_holds_no_longer_is_counted_i
     assert running.losses() == [(KEY.replace("aero/", "beta/"), 500 - kept, "cache")]
     assert 0 < kept < 200
     assert running.error is None
+
+
+def test_losses_of_several_keys_add_up_in_the_status(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their publishers have no cache; a time-out is short, so that what does not answer is soon given up."""
+    monkeypatch.setattr(history, "ANSWER_S", 0.1)
+    running, other = record(), KEY.replace("aero/", "beta/")
+    for key, lost in ((KEY, 10), (other, 5)):
+        publish_without_cache(gathering, key, {number: bytes(4) for number in (0, lost + 1)})
+    running.await_written(6)
+    running.end()
+    assert sorted(running.losses()) == [(KEY, 10, "gone"), (other, 5, "gone")]
+    status = running.last_status()
+    assert status.lost == 15
+    assert status.notes[0].startswith("15 messages lost: not received")
 
 
 @pytest.mark.realtime

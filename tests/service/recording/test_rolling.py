@@ -232,6 +232,37 @@ def test_the_end_on_a_full_disk_is_one_line_and_what_was_written_can_be_read(tmp
     )
 
 
+def test_a_disk_that_is_full_in_the_midst_of_a_chunk_leaves_no_torn_one(tmp_path: Path, disk: Disk) -> None:
+    """What the disk had taken of it is taken back at once: a crash then would leave a file that ends in it."""
+    run, path = Run(tmp_path / "a.mcap"), tmp_path / "a.mcap"
+    run.take(250)
+    whole, kept = path.stat().st_size, numbers(path)
+    disk.room = whole + 100
+    run.take(100)
+    assert run.log.trouble
+    assert path.stat().st_size == whole
+    assert numbers(path) == kept
+    disk.room = EVERYTHING
+    run.log.close()
+
+
+def test_a_description_that_is_published_again_unchanged_is_written_once_and_at_the_end(tmp_path: Path) -> None:
+    run = Run(tmp_path / "a.mcap")
+    for text in (b'{"a":1}', b'{"a":2}', b'{"a":2}', b'{"a":2}'):
+        run.log.add_description(DESCRIPTION, text)
+    run.log.close()
+    written = [entry["json"] for name, entry in contents(tmp_path / "a.mcap")[1] if name == DESCRIPTION_METADATA]
+    assert written == ['{"a":1}', '{"a":2}', '{"a":2}']
+
+
+@pytest.mark.parametrize(("number", "sequence"), [(70_000, 70_000), (2**32 - 1, 2**32 - 1), (2**32 + 5, 5)])
+def test_a_sequence_is_the_number_of_the_message_modulo_its_32_bits(tmp_path: Path, number: int, sequence: int) -> None:
+    run = Run(tmp_path / "a.mcap")
+    run.log.add(Delivery(KEY, b"x", number, START_NS, 1), START_NS, [])
+    run.log.close()
+    assert [message.sequence for message in by_mcap(tmp_path / "a.mcap")] == [sequence]
+
+
 # ── files of a run ──
 
 
