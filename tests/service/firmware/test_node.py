@@ -52,6 +52,7 @@ void aero_port_actuate(int64_t k, const double v[AERO_ACTUATORS])
     ticks[actuations] = k;
     memcpy(volts[actuations++], v, sizeof *volts);
 }
+void aero_port_enable(int on) { (void)on; }
 void aero_port_measure(int64_t k, double q[4], double w[3])
 {
     (void)k;
@@ -97,14 +98,10 @@ class Frame(ctypes.Structure):
 
 
 class Motors(RecordingPlant):
-    """A plant that records every call of `actuate`, clipped to the supply as an emulated one does."""
-
-    def __init__(self, actuators: int) -> None:
-        super().__init__(actuators)
-        self.acts: list[tuple[float, ...]] = []
+    """A plant that records the voltages of every period, clipped to the supply as an emulated one does."""
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        self.acts.append(tuple(max(-SUPPLY, min(SUPPLY, each)) for each in voltages))
+        super().actuate([max(-SUPPLY, min(SUPPLY, volts)) for volts in voltages])
 
 
 class ScriptedBus:
@@ -310,13 +307,15 @@ def test_the_node_in_c_does_what_the_node_in_python_does(
     receives, sends, actuations = (ctypes.c_int.in_dll(c, each) for each in ("receives", "sends", "actuations"))
     reading = (ctypes.c_double * 7).in_dll(c, "reading")
     volts = (ctypes.c_double * wire.actuators * 4096).in_dll(c, "volts")
+    ticks = (ctypes.c_int64 * 4096).in_dll(c, "ticks")
     state, cause, refused, stale = (ctypes.c_int() for _ in range(4))
-    in_force = (ctypes.c_double * wire.actuators)()
+    commanded = (ctypes.c_double * wire.actuators)()
 
     clock, bus, plant = FakeClock(), ScriptedBus(), Motors(wire.actuators)
     monkeypatch.setattr("aeroloop.protocol.transport.can_link.time", clock)
     monkeypatch.setattr("aeroloop.protocol.transport.can_link.can.Bus", lambda **_: bus)
     endpoint = settings.plant.endpoint(plant, settings.loop, wire)
+    at_motors = plant.voltages  # of the node in C
     front = CanNetwork(settings.can, settings.loop, endpoint)
     controller, k, seen = Controller(settings, seed=1), -1, Counter[Outcome]()
     c.start()
@@ -327,7 +326,7 @@ def test_the_node_in_c_does_what_the_node_in_python_does(
         frames, measured = controller.frames(clock.now_ns), controller.measure()
 
         bus.sent.clear()
-        plant.acts.clear()
+        plant.periods.clear()
         plant.now = measured
         bus.deliver(frames)
         front.take_inbox()
@@ -344,13 +343,21 @@ def test_the_node_in_c_does_what_the_node_in_python_does(
         for i, (identifier, data) in enumerate(frames):
             received[i] = Frame(identifier, len(data), (ctypes.c_uint8 * 64)(*data))
         reading[:] = [*measured.attitude, *measured.rate]
-        c.turn(ctypes.c_int64(k), *map(ctypes.byref, (state, cause, refused, stale)), in_force)
+        c.turn(ctypes.c_int64(k), *map(ctypes.byref, (state, cause, refused, stale)), commanded)
 
         assert [(each.id, bytes(each.data[: each.size])) for each in sent[: sends.value]] == bus.sent
         assert list(PlantState)[state.value] is endpoint.state
         assert cause.value == (endpoint.trip.number if endpoint.trip else 0)
-        assert tuple(in_force) == endpoint.voltages
-        assert [tuple(row) for row in volts[: actuations.value]] == plant.acts
+        assert tuple(commanded) == endpoint.voltages
+        in_force: list[tuple[float, ...]] = []  # the voltages that the node in C had in force
+        first_period = k - len(plant.periods)
+        for i in range(actuations.value):
+            passed = ticks[i] - first_period
+            in_force += [at_motors] * (passed - len(in_force))
+            at_motors = tuple(volts[i])
+        in_force += [at_motors] * (len(plant.periods) - len(in_force))
+        assert in_force == plant.periods
+        assert at_motors == plant.voltages
         controller.sent(bus.sent)
         assert stale.value == endpoint.stale
         if isinstance(front.link, CanLink):
