@@ -74,7 +74,8 @@ class ZenohLink(Link):
 
     `lengths` are those of the frames received [bytes]; `refused` counts frames of any other. If `lossless`, `send`
     blocks when a peer does not keep up, instead of dropping: for lockstep, where each frame is waited for. A plant's
-    link may have a second session, `also`: frames are received on both, and sent on that which has a subscriber.
+    link may have a second session, `also`: frames are received and published on both, and Zenoh carries them where a
+    peer subscribes.
     """
 
     def __init__(
