@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from math import hypot, isfinite
+from math import hypot, isfinite, isnan
 from textwrap import shorten
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
@@ -122,6 +122,11 @@ class Plant(ABC):
         """Set 0 V and release all resources. A second call does nothing."""
 
 
+def within_supply(voltages: Sequence[float], limit: float) -> tuple[float, ...]:
+    """The voltages clipped to ±`limit` [V]; NaN is 0 V. Shape as given."""
+    return tuple(0.0 if isnan(volts) else max(-limit, min(limit, volts)) for volts in voltages)
+
+
 def class_of(kind: str) -> type[Plant]:
     """The class that `plant.kind` names. Raises PluginError."""
     return plugins.find("plant.kind", kind, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
@@ -163,8 +168,7 @@ class OwnPlant(Plant):
         self.actuators = count
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        limit = self._limit
-        self._call(self._plant.actuate, tuple(max(-limit, min(limit, volts)) for volts in voltages))
+        self._call(self._plant.actuate, within_supply(voltages, self._limit))
 
     def enable(self, on: bool) -> None:
         self._call(self._plant.enable, on)

@@ -173,6 +173,8 @@ class PlantSettings(BaseModel, extra="forbid"):
         """
         faults = Faults(plant.actuators, loop.period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
         full = min(self.voltage_limit, wire.voltage.quantizer().outermost)
+        if self.via == "quanser":
+            full = min(full, self.quanser.voltage_limit)  # the board clips there
         try:
             faults.inject(self.parsed_faults, "configured")
             return Endpoint(

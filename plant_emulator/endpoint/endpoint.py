@@ -12,12 +12,16 @@ received until another replaces it. One controller at a time holds the plant, by
 
 A plant that tripped or started unarmed stays at 0 V and refuses claims with the reason. A claim with `auto_arm` arms
 the plant itself, except after `stop`.
+
+Whatever ends a session, the end itself sets 0 V and switches the power stage off, before anybody publishes, logs or
+writes that it ended. It does not wait for the next tick, which in lockstep may never come.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from math import isfinite
 from typing import Any, Final, Literal, NamedTuple
 
@@ -25,6 +29,7 @@ from aeroloop.plant_emulator.endpoint.limits import LimitMonitor
 from aeroloop.plant_emulator.faults.injection import Faults, Transition
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.plant import Plant
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import (
     PROTOCOL_VERSION,
     Claim,
@@ -37,6 +42,7 @@ from aeroloop.protocol.messages.models import (
 )
 from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Outcome, PlantChange, PlantChangeKind
+from aeroloop.protocol.plugins import exception_line
 from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.spec import FIRST_COMMAND_S, WATCHDOG_S, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Sender
@@ -119,6 +125,7 @@ class VehicleClaim:
         self.cause: str | None = None if armed else "not armed since it was started"  # why the latch refuses claims
         self.operator_only = False  # whether only an operator's `arm` clears the latch
         self.unavailable: str | None = None  # the owner's reason to refuse every claim, such as a bus fault
+        self.failure: Exception | None = None  # an exception that ends this process
         self.last: SessionRecord | None = None  # of the last session, for the next controller
         self.notices: list[Notice] = []  # events since the owner last emptied the list
         self.changes: list[PlantChange] = []  # likewise, for the trace
@@ -202,9 +209,21 @@ class VehicleClaim:
         """End the session on its holder's request: 0 V. False if another session or none runs."""
         if session != self.session:
             return False
-        self.record_change("release", name=session)
-        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}", "released")
+        self._release(session, f"released by {self.holder}")
         return True
+
+    def leave(self) -> None:
+        """End the session, if one runs, because this process ends in order: 0 V. It latches nothing."""
+        if self.session is not None:
+            self._release(self.session, "released: the plant end stops")
+
+    def fail(self, error: Exception) -> None:
+        """Trip for an exception that ends this process, and latch it as a stop. Only the first one counts."""
+        if self.failure is not None:
+            return
+        self.failure = error
+        text = str(error) if isinstance(error, AeroloopError) else f"unexpected {exception_line(error)}"
+        self.stop(TripCause.PLANT, text)
 
     def arm(self) -> bool:
         """Clear the latch, so that the next claim is granted. False while a controller holds the plant."""
@@ -231,6 +250,11 @@ class VehicleClaim:
         self.operator_only = True
         if self.last is not None:
             self.last = self.last.model_copy(update={"ended": cause})
+
+    def raise_failure(self) -> None:
+        """Raise `failure`, if there is one: its owner calls this where its loop can end."""
+        if self.failure is not None:
+            raise self.failure
 
     def lost(self, controller: str) -> None:
         """Trip if this controller, having lost its liveliness token, holds the plant."""
@@ -271,8 +295,7 @@ class VehicleClaim:
                 return Outcome.INVALID
             voltages = self.off
         self.voltages, self._codes = voltages, codes
-        if self.state is not PlantState.DRIVEN:
-            self._machine.fire(PlantTrigger.COMMAND)
+        self._machine.fire(PlantTrigger.COMMAND)
         return Outcome.ACTED
 
     def _may_be_invalid(self, echo: int) -> bool:  # noqa: ARG002  # the relay has no measurements to judge by
@@ -285,15 +308,22 @@ class VehicleClaim:
         self._start = self.ticked + 1  # of its first measurement
 
     def _trip(self, cause: TripCause, reason: str) -> None:
-        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
-        self.cause, self.trip = f"{reason}: 0 V", cause
+        self.cause = f"{reason}: 0 V"
+        self.trip = cause
         self.trips[cause] += 1
+        self._end(PlantTrigger.TRIP, "tripped", self.cause, cause)
+
+    def _release(self, session: str, text: str) -> None:
+        self.record_change("release", name=session)
+        self._end(PlantTrigger.RELEASE, "released", text, "released")
 
     def _clear(self) -> None:
         self.cause = self.trip = None
         self._machine.fire(PlantTrigger.ARM)
 
     def _end(self, trigger: PlantTrigger, kind: EventKind, text: str, ended: TripCause | Literal["released"]) -> None:
+        """Set 0 V, then end the session. Where 0 V could not be set, the plant has failed, which is a trip, too."""
+        failure = self._switch_off()
         self._notice(kind, text)
         if self.session is not None:
             how = {"ended": ended, "ended_tick": self.event_tick}
@@ -302,6 +332,12 @@ class VehicleClaim:
         self.session = self.holder = None
         self.voltages, self._codes = self.off, ()
         self._freshness.reset()
+        if failure is not None:
+            self.fail(failure)
+
+    def _switch_off(self) -> Exception | None:
+        """Bring the motors to 0 V now, by all means there are. Returns what prevented it; None if nothing did."""
+        return None
 
     def _notice(self, kind: EventKind, text: str) -> None:
         self.notices.append(Notice(kind, text, self.session, self.event_tick))
@@ -332,6 +368,7 @@ class Endpoint(VehicleClaim):
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
         super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.plant = plant
+        self._closed = False  # whether the plant was closed because it refused 0 V
         self.outgoing: list[bytes] = []  # after a tick: what the faults of frames leave of the measurement, in order
         self._faults, self._limits = faults or Faults(plant.actuators, period_ns * 1e-9), limits
         self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
@@ -363,7 +400,11 @@ class Endpoint(VehicleClaim):
 
         Returns:
             The measurement frame, before its faults; UNCHANGED if it would repeat the last one; None without a session.
+
+        Raises:
+            Exception: What the plant raises, and `failure`, after which no tick touches the plant.
         """
+        self.raise_failure()
         faults = self._faults
         if self.session != self._last_session:
             self._last_session = self.session
@@ -374,9 +415,8 @@ class Endpoint(VehicleClaim):
             frame = self._malformed
         commands = faults.passes("command", frame)
         self.outcome = Outcome.NONE if commands or frame is None else Outcome.WITHHELD
-        self.plant.enable(self.session is not None)  # after a claim or a release since the last tick
+        self.plant.enable(self.session is not None)
         measurement = self._advanced(commands[-1] if commands else None, k)
-        self.plant.enable(self.session is not None)  # after a trip in this one
         if measurement == UNCHANGED and not self.lockstep:  # not a frame, so no fault acts on it
             self.outgoing = faults.passes("measurement", None) or [UNCHANGED]
         else:
@@ -393,7 +433,7 @@ class Endpoint(VehicleClaim):
         while self.ticked < k:
             if (reason := self._freshness.overdue(self._now_ns)) is not None:
                 self._trip(TripCause.COMMAND_TIMEOUT, reason)
-            self.plant.actuate(self._faults.voltages(self.voltages))
+            self._actuate()
             self.plant.advance()
             self.ticked += 1
             self._faults.advance(self.plant)
@@ -406,7 +446,8 @@ class Endpoint(VehicleClaim):
         seen = self._faults.measure(self.plant)
         if self._limits is not None and (trip := self._limits.check(seen, self.voltages)) is not None:
             self._trip(*trip)
-            self.plant.actuate(self._faults.voltages(self.voltages))
+            # The plant has 0 V. Faults by chance draw a number here, as they did in every log so far.
+            self._faults.voltages(self.voltages)
             return None
         codes = self._no_measurement
         if valid := isfinite(sum(seen.attitude) + sum(seen.rate)):
@@ -414,6 +455,30 @@ class Endpoint(VehicleClaim):
             codes = [quantizer.encode(value) for quantizer, value in zip(self._quantizers, values, strict=True)]
         self._invalid[self.counter] = not valid
         return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else UNCHANGED
+
+    def _actuate(self) -> None:
+        """Put the voltages in force, as the motors' faults leave them. Raises `failure`."""
+        self.raise_failure()
+        self.plant.actuate(self._faults.voltages(self.voltages))
+
+    def _switch_off(self) -> Exception | None:
+        """Set 0 V and switch the power stage off, past all injected faults; a plant that refuses either is closed."""
+        if self._closed:
+            return None
+        failure: Exception | None = None
+        try:
+            self.plant.actuate(self.off)
+        except Exception as error:
+            failure = error
+        try:
+            self.plant.enable(False)
+        except Exception as error:
+            failure = failure or error
+        if failure is not None:
+            self._closed = True
+            with suppress(Exception):  # the first failure is the one to show
+                self.plant.close()
+        return failure
 
     @property
     def _now_ns(self) -> int:

@@ -25,7 +25,8 @@ class LimitMonitor:
 
     def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
         self._settings, self._period_ns, self._full = settings, period_ns, voltage_limit
-        self.least_upright = cos(radians(settings.max_tilt_deg))
+        # At 180° no attitude is beyond it: rounding and a length off 1 take the cosine below −1, but not to −2.
+        self.least_upright = -2.0 if settings.max_tilt_deg == 180.0 else cos(radians(settings.max_tilt_deg))
         self.reset()
 
     def reset(self) -> None:

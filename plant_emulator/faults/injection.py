@@ -169,6 +169,11 @@ class ActingFault:
                 passed.append(frame)
         return passed
 
+    def forget_frames(self) -> None:
+        """Forget the frames held back and the one that passed last."""
+        self.held.clear()
+        self._last = None
+
     def _garbled(self, frame: bytes) -> bytes:
         bit = int(self._random.integers(8 * len(frame)))
         garbled = bytearray(frame)
@@ -322,6 +327,7 @@ class Faults:
         return frames
 
     def forget_frames(self) -> None:
-        """Drop the frames held back: they belong to the last session's keys."""
+        """Forget all frames, held back or last: those of another session must not act in this one."""
+        self._last_frame.clear()
         for fault in (*self._acting["measurement"], *self._acting["command"]):
-            fault.held.clear()
+            fault.forget_frames()

@@ -8,6 +8,7 @@ has another wire spec or trips. It reopens a failed bus by itself; the plant is 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from threading import Condition
 from typing import Final
 
@@ -34,6 +35,7 @@ class Relay(VehicleClaim):
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
         super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
+        self.release_node: Callable[[], None] = lambda: None  # called first of all when a session ends
         self.number = 0
         self._ticks = self._tick_counter()
         self._silent_measurements = lockstep and wire.transmit.measurement == "on_change"
@@ -89,6 +91,13 @@ class Relay(VehicleClaim):
     def _tick_counter(self) -> TickCounter:
         return TickCounter(self.period_ns, self._counters, lockstep=self.lockstep)
 
+    def _switch_off(self) -> Exception | None:
+        try:
+            self.release_node()
+        except Exception as error:
+            return error
+        return None
+
     def _count(self, ticks: int) -> None:
         self.ticked += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
@@ -113,6 +122,7 @@ class Bridge:
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
         self._network = ZenohNetwork(role, loop, self._relay, settings, self._changed)
+        self._relay.release_node = self._release_node
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._number = self._relay.number  # of the last session that the node was sent
         self._arrival: Arrival | None = None  # the last command since the last tick
@@ -120,31 +130,38 @@ class Bridge:
 
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
+        relay, bus = self._relay, self._bus
+        try:
+            self._forward()
+        except Exception as error:
+            relay.fail(error)
+            raise
+        finally:
+            relay.leave()
+            bus.close()
+            self._network.leave()
+
+    def _forward(self) -> None:
+        """Forward frames until the role stops."""
         network, relay, bus = self._network, self._relay, self._bus
         network.notes = machine = [] if self._loop.lockstep else prepare_process(self._loop)
         network.serve()
-        try:
-            while not self._role.stop.is_set():
-                with self._changed:
-                    self._changed.wait_for(self._frame_pending, WAIT_S)
-                relay.unavailable = self._unavailable()
-                network.take_inbox()
-                self._follow_state()
-                self._pass_frames()
-                if relay.watch(now_ns := time.monotonic_ns()):
-                    self._account(None, now_ns)
-                self._watch_node()
-                self._follow_state()
-                if bus.errors or bus.refused:
-                    network.notes = [*machine, f"the bus: {bus.errors} errors, {bus.refused} malformed frames"]
-                network.follow_session()
-                collect_garbage()
-        finally:
-            if relay.session is not None:
-                relay.release(relay.session)
+        while not self._role.stop.is_set():
+            with self._changed:
+                self._changed.wait_for(self._frame_pending, WAIT_S)
+            relay.unavailable = self._unavailable()
+            network.take_inbox()
+            relay.raise_failure()
             self._follow_state()
-            bus.close()
-            network.leave()
+            self._pass_frames()
+            if relay.watch(now_ns := time.monotonic_ns()):
+                self._account(None, now_ns)
+            self._watch_node()
+            self._follow_state()
+            if bus.errors or bus.refused:
+                network.notes = [*machine, f"the bus: {bus.errors} errors, {bus.refused} malformed frames"]
+            network.follow_session()
+            collect_garbage()
 
     def _frame_pending(self) -> bool:
         link = self._network.link
@@ -208,3 +225,7 @@ class Bridge:
             self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
         state = PlantState.GRANTED if relay.session else PlantState.IDLE
         self._bus.beat_when_due(Heartbeat(state, relay.number, self._fingerprint))
+
+    def _release_node(self) -> None:
+        """Send the node the end of the session, at which it sets 0 V."""
+        self._bus.beat(Heartbeat(PlantState.IDLE, self._relay.number, self._fingerprint))

@@ -48,6 +48,7 @@ class CanNetwork(PlantNetwork):
         """Follow the controller side's heartbeat: begin, end or lose a session."""
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
+            endpoint.lost(MASTER)  # before the bus is opened again, which may take longer than the watchdog
             self._warn("bus", "fault", f"{bus.fault}; trying again twice a second")
             bus.reopen()
         peer = bus.peer
@@ -85,10 +86,10 @@ class CanNetwork(PlantNetwork):
         self._bus.beat_when_due(Heartbeat(endpoint.state, cause, self._fingerprint))
 
     def leave(self) -> None:
-        if self._endpoint.session is not None:
-            self._endpoint.release(self._endpoint.session)
-        self.follow_session()
-        self._bus.close()
+        try:
+            self.follow_session()
+        finally:
+            self._bus.close()
 
     def _begin(self, peer: Heartbeat) -> None:
         if peer.fingerprint != self._fingerprint:

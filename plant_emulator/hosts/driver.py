@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.plant import PlantError
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.timing import Clock, LoopTiming, TickGrid
@@ -89,19 +88,26 @@ class Driver:
         return TickCounter(self._loop.period_ns, counters, lockstep=True)
 
     def run(self) -> None:
-        """Run, then close the plant at 0 V and leave the network. Raises PlantError if the plant failed; it tripped."""
-        self._network.serve()
+        """Run until `stop` is set, then end the session at 0 V, close the plant and leave the network.
+
+        Raises:
+            Exception: Whatever ended the loop instead, such as the plant's PlantError; the plant tripped, latched.
+        """
+        endpoint = self._endpoint
         try:
+            self._network.serve()
             if self._loop.lockstep:
                 self._run_lockstep()
             else:
                 self._run_real_time()
-        except PlantError as error:
-            self._endpoint.stop(TripCause.PLANT, str(error))
+            endpoint.leave()
+            endpoint.raise_failure()
+        except Exception as error:
+            endpoint.fail(error)
             raise
         finally:
             try:
-                self._endpoint.plant.close()
+                endpoint.plant.close()
             finally:
                 self._network.leave()
 
@@ -117,6 +123,7 @@ class Driver:
             due_ns = grid.due_ns if grid else woke_ns
             before = endpoint.session
             network.take_inbox()
+            endpoint.raise_failure()
             if grid and endpoint.session not in (None, before):
                 # Granting took time, and the controller takes its grid from the session's first measurement.
                 k, skipped = grid.wait(), grid.skipped
@@ -131,14 +138,15 @@ class Driver:
             timing.done()
 
     def _run_lockstep(self) -> None:
-        network, arrival = self._network, None
+        network, endpoint, arrival = self._network, self._endpoint, None
         while not self._stop.is_set():
             network.take_inbox()
+            endpoint.raise_failure()
             if network.link is None or network.steps == 0:
                 network.wait_for_inbox(IDLE_WAIT_S)
                 network.follow_session()
                 continue
-            echo = self._tick(arrival, self._endpoint.ticked + 1)
+            echo = self._tick(arrival, endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
             if network.steps is not None:
                 network.steps -= 1
@@ -146,16 +154,17 @@ class Driver:
                     network.publish_status()  # ends the wait of the `advance` query's sender
 
     def _await_answer(self, echo: int) -> Arrival | None:
-        """Wait for the command that echoes a counter. Returns None if the session ends first."""
-        network = self._network
+        """Wait for the command that echoes a counter. Returns None if the session ends first, even if a next begins."""
+        network, endpoint = self._network, self._endpoint
+        session = endpoint.session
         deadline = self._clock.monotonic() + ANSWER_TIMEOUT_S
-        while network.link and not self._stop.is_set():
+        while network.link and endpoint.session == session and not self._stop.is_set():
             arrival = network.link.wait(IDLE_WAIT_S)
-            if arrival is not None and self._endpoint.wire.command.counter(arrival.frame) in (echo, None):
+            if arrival is not None and endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
             network.take_inbox()
-            if self._clock.monotonic() > deadline:
-                self._endpoint.expire(TripCause.NO_ANSWER, f"no answer for {ANSWER_TIMEOUT_S:g} s")
+            if endpoint.session == session and self._clock.monotonic() > deadline:
+                endpoint.expire(TripCause.NO_ANSWER, f"no answer for {ANSWER_TIMEOUT_S:g} s")
             network.follow_session()
         return None
 

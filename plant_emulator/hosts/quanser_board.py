@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from math import isnan, pi
+from math import pi
 from typing import Any, Final
 
 import numpy as np
 
 from aeroloop.plant_emulator.model.emulated import NO_MEASUREMENT, Sensors, SensorSettings
-from aeroloop.plant_emulator.plant import Measurement, Plant, PlantError
+from aeroloop.plant_emulator.plant import Measurement, Plant, PlantError, within_supply
 from aeroloop.plant_emulator.settings import QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
 
@@ -93,8 +93,7 @@ class QuanserPlant(Plant):
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """NaN is 0 V. An expired board watchdog is cleared by 0 V only; until then nothing is written."""
-        limit = self._settings.voltage_limit
-        self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
+        self._held = within_supply(voltages, self._settings.voltage_limit)
         self._start()
         if not self._expired or (not any(self._held) and self._clear()):
             self._write_outputs()

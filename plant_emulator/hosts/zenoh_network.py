@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from threading import Condition
 from typing import Final
@@ -49,8 +49,9 @@ def run_plant(role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSet
         plant: Plant = QuanserPlant(settings.quanser, loop.period, settings.watchdog_s)
     else:
         plant = settings.make(loop.period)
-    endpoint = settings.endpoint(plant, loop, wire)
-    Driver(endpoint, ZenohNetwork(role, loop, endpoint, settings), loop, role.stop).run()
+    with closing(plant):
+        endpoint = settings.endpoint(plant, loop, wire)
+        Driver(endpoint, ZenohNetwork(role, loop, endpoint, settings), loop, role.stop).run()
 
 
 class ZenohNetwork(PlantNetwork):
@@ -90,6 +91,7 @@ class ZenohNetwork(PlantNetwork):
             self._since = found.since
         self._published = endpoint.state, -1, time.monotonic()  # by the last status: state and tick, and when
         self._status_due = self._others_due = 0
+        self._recorder = RecorderWatch(role)
         self._forget_holder: Callable[[], None] = lambda: None
 
     @property
@@ -117,7 +119,6 @@ class ZenohNetwork(PlantNetwork):
         self._others = role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role=role.role), RingChannel(1), allowed_origin=zenoh.Locality.REMOTE
         )
-        self._recorder = RecorderWatch(role)
         role.announce()
         if (found := self._latch_file.found) is None:
             role.event("started", f"{role.vehicle} waits for a claim")
@@ -156,11 +157,12 @@ class ZenohNetwork(PlantNetwork):
 
     def follow_session(self) -> None:
         endpoint = self._endpoint
+        if endpoint.notices:
+            self._keep_latch()
         self._trace.follow(endpoint)
         if endpoint.session is None:
             self._close_link()
         if endpoint.notices:
-            self._keep_latch()
             for notice in endpoint.notices:
                 self._role.event(*notice)
             endpoint.notices.clear()
@@ -204,9 +206,11 @@ class ZenohNetwork(PlantNetwork):
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
     def leave(self) -> None:
-        self.follow_session()
-        self._trace.finish()
-        self._latch_file.wait()
+        try:
+            self.follow_session()
+            self._trace.finish()
+        finally:
+            self._latch_file.wait()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.publish_status()
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
 from aeroloop.plant_emulator.model.bodies import Mechanism
-from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.plant_emulator.plant import Measurement, Plant, State, within_supply
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.symbolic import Compiled
@@ -354,8 +354,7 @@ class EmulatedPlant(Plant):
             self._sensors.follow(other._sensors)
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        limit = self._limit
-        self._u[:] = array("d", [max(-limit, min(limit, voltage)) for voltage in voltages])
+        self._u[:] = array("d", within_supply(voltages, self._limit))
 
     def advance(self) -> None:
         if self._wind is not None:

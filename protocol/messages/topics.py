@@ -44,7 +44,7 @@ NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 QUERIES_PER_S: Final = 50.0
 """Most queries a second that a process takes on a topic from one link. Zenoh applies any rule that a wildcard meets."""
 
-FRAME_BYTES: Final = 256  # more than the longest frame: six elements of 64 bits and a counter
+FRAME_BYTES: Final = 256  # more than the longest frame: eight elements of 64 bits and a counter
 SAMPLE_BYTES: Final = 2048  # one tick's telemetry or truth
 MESSAGE_BYTES: Final = 16_384  # an event of many lines
 STATUS_BYTES: Final = 65_536  # a status with all notes and twice as many faults as may act at a time

@@ -23,6 +23,7 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Eve
 from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, MessageError
 from aeroloop.protocol.messages.states import STOPPED
 from aeroloop.protocol.runtime.host import host_facts, name_process, versions
+from aeroloop.protocol.runtime.stderr_log import dropped_lines
 from aeroloop.protocol.runtime.timing import Clock, Throttle
 from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
 from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
@@ -309,8 +310,14 @@ class Node:
         self._skipped.append((now, status.skipped))
         while now - self._skipped[0][0] > _RECENT_S:
             self._skipped.popleft()
-        more = {"recent_skipped": status.skipped - self._skipped[0][1], "certificate_until": self._certificate_until}
-        status = status.model_copy(update={**more, "process": self.process})
+        more: dict[str, Any] = {
+            "recent_skipped": status.skipped - self._skipped[0][1],
+            "certificate_until": self._certificate_until,
+            "process": self.process,
+        }
+        if dropped := dropped_lines():
+            more["notes"] = [*status.notes, f"the log: {dropped} lines were dropped, as nothing reads stderr"]
+        status = status.model_copy(update=more)
         self._last = now, status
         self.publish("status", status)
 

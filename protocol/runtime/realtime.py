@@ -8,6 +8,7 @@ import os
 import platform
 import socket
 import struct
+from contextlib import suppress
 from errno import EINVAL
 from pathlib import Path
 from typing import Final
@@ -50,12 +51,14 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     threads = [int(thread) for thread in os.listdir("/proc/self/task")]
     try:
         for thread in threads if settings.cpus else ():
-            os.sched_setaffinity(thread, settings.cpus)
+            with suppress(ProcessLookupError):  # a thread that has ended meanwhile
+                os.sched_setaffinity(thread, settings.cpus)
     except OSError as error:
         refused.append(f"affinity to CPUs {settings.cpus}: {error.strerror}")
     try:
         for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
+            with suppress(ProcessLookupError):
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:
         refused.append(f"SCHED_FIFO {PRIORITY}: {error.strerror} (raise LimitRTPRIO)")
     if refused and settings.realtime == "strict":

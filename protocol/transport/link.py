@@ -74,8 +74,8 @@ class ZenohLink(Link):
 
     A received frame that `accepts` says no to is dropped and counted by `refused`; it is called for each frame in
     Zenoh's thread. If `lossless`, `send` blocks when a peer does not keep up, instead of dropping: for lockstep, where
-    each frame is waited for. A plant's link may have a second session, `also`: frames are received on both, and sent on
-    that which has a subscriber.
+    each frame is waited for. A plant's link may have a second session, `also`: frames are received and published on
+    both, and Zenoh carries them where a peer subscribes.
     """
 
     def __init__(

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from select import select
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,8 @@ DAEMONS = ("controller", "plant", "can-node", "router", "recorder")
 
 def end_unstarted(*_: object) -> None:
     """Signal handler: end this process, a daemon that has not begun."""
-    os.write(2, b"aeroloop: ended by a signal before it had started\n")
+    if select([], [2], [], 0)[1]:  # else nothing reads stderr, and the write would wait
+        os.write(2, b"aeroloop: ended by a signal before it had started\n")
     os._exit(0)
 
 
@@ -53,6 +55,7 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None
     begun, stop = _stop_on_signals()
     from aeroloop.protocol.runtime.node import Node
     from aeroloop.protocol.runtime.realtime import no_linger
+    from aeroloop.protocol.runtime.stderr_log import flush_log
     from aeroloop.protocol.transport.zenoh_config import THREADS
     from aeroloop.service.daemon.claim import controller_name
 
@@ -60,25 +63,24 @@ def run_role(kind: str, settings: Settings, run: Callable[[Node], None]) -> None
     if (refused := no_linger()) is not None:
         logging.getLogger("aeroloop").warning("%s", refused)
     name = controller_name() if kind == "controller" else None
-    with Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
-        begun.set()
-        run(role)
+    try:
+        with Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
+            begun.set()
+            run(role)
+    finally:
+        flush_log()
 
 
 def run_alone(run: Callable[[Event], None]) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
     begun, stop = _stop_on_signals()
+    from aeroloop.protocol.runtime.stderr_log import flush_log
+
     begun.set()
-    run(stop)
-
-
-class _OneLine(logging.Formatter):
-    """Formats a record as one printable line, whatever names and texts of the network it has."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # of the library
-        from aeroloop.protocol.printable import printable
-
-        return printable(super().formatMessage(record))
+    try:
+        run(stop)
+    finally:
+        flush_log()
 
 
 def _stop_on_signals() -> tuple[Event, Event]:
@@ -87,14 +89,13 @@ def _stop_on_signals() -> tuple[Event, Event]:
     Before the process has begun, a signal ends it. Why a thread waits for signals: a handler would run in the main
     thread, which may wait in Zenoh, or hold the lock of the event that the handler sets: it would never end.
     """
-    handler = logging.StreamHandler()
-    line = "%(asctime)s %(levelname)s %(role)s: %(message)s"
-    handler.setFormatter(_OneLine(line, defaults={"role": "aeroloop"}))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    from aeroloop.protocol.runtime.stderr_log import log_to_stderr
+
     begun, stop, signals = Event(), Event(), {signal.SIGTERM, signal.SIGINT}
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; else a closed terminal
         signals.add(signal.SIGHUP)
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # in each thread that is started from here on
+    log_to_stderr()
 
     def wait() -> None:
         signal.sigwait(signals)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from json import dumps
 from pathlib import Path
 from shlex import quote
@@ -117,9 +118,10 @@ def can_node(config: Config = None, overrides: Overrides = None) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanNetwork
         from aeroloop.plant_emulator.hosts.driver import Driver
 
-        loop, plant = settings.loop, settings.plant
-        endpoint = plant.endpoint(plant.make(loop.period), loop, settings.wire)
-        Driver(endpoint, CanNetwork(settings.can, loop, endpoint), loop, stop).run()
+        loop = settings.loop
+        with closing(settings.plant.make(loop.period)) as plant:
+            endpoint = settings.plant.endpoint(plant, loop, settings.wire)
+            Driver(endpoint, CanNetwork(settings.can, loop, endpoint), loop, stop).run()
 
     run_alone(run)
 

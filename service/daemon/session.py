@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import secrets
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,8 +23,9 @@ from aeroloop.protocol.messages.states import CONTROLLER_TABLE, Machine
 from aeroloop.protocol.messages.states import ControllerState as State
 from aeroloop.protocol.messages.states import ControllerTrigger as Trigger
 from aeroloop.protocol.messages.trace import ControllerRow, Received, Sent, TraceWriter
-from aeroloop.protocol.runtime.node import Node
+from aeroloop.protocol.runtime.node import Node, log
 from aeroloop.protocol.runtime.realtime import collect_garbage
+from aeroloop.protocol.runtime.stderr_log import flush_log
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.transmit import UNCHANGED
@@ -320,5 +320,6 @@ class LawWatch(Thread):
             if lasts_s > REPORT_S:
                 self._role.warn("law", "fault", f"{self._law} has not ended a tick for {lasts_s:.1f} s")
             if lasts_s > REPORT_S and stopping_s > STOP_S:
-                sys.stderr.write(f"aeroloop: {self._law} does not end its tick: the process ends without it\n")
+                log.error("%s does not end its tick: the process ends without it", self._law)
+                flush_log()
                 os._exit(1)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
 from aeroloop.plant_emulator.hosts.can_bridge import Bridge
+from aeroloop.plant_emulator.hosts.latch_file import Latch
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Grant, Release
+from aeroloop.protocol.messages.models import Event, EventKind, Grant, Release, Status
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
+from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.spec import LoopSettings
 from tests.support.can_in_process import Flaws, virtual
 from tests.support.plant_end import WIRE, Asker
@@ -48,7 +53,8 @@ class Ends:
         self._session.liveliness().declare_subscriber(token, lambda _: alive.set(), history=True)
         self._says = Heartbeat(PlantState.IDLE, 0, OURS)
         self._over = threading.Event()
-        self._threads = [threading.Thread(target=run) for run in (self._bridge.run, self._beat)]
+        self.raised: Exception | None = None
+        self._threads = [threading.Thread(target=run) for run in (self._run, self._beat)]
         for thread in self._threads:
             thread.start()
         assert alive.wait(PATIENCE_S)
@@ -78,6 +84,16 @@ class Ends:
         self._says = Heartbeat(state, cause.number if cause else 0, mark)
         self.node.beat(self._says)
 
+    def _run(self) -> None:
+        try:
+            self._bridge.run()
+        except Exception as error:
+            self.raised = error
+
+    def join(self) -> None:
+        """Wait until the bridge has ended by itself."""
+        self._threads[0].join()
+
     def fall_silent(self) -> None:
         self._over.set()
         self._threads[1].join()
@@ -101,6 +117,10 @@ class Ends:
         if idle:
             eventually("idle on the bus", lambda: self.received_state() is PlantState.IDLE)
         return next(event.text for event in self.events if event.kind == "tripped")
+
+    def trips(self) -> dict[TripCause, int]:
+        """Trips so far by their causes, as a status counts them."""
+        return Status.model_validate_json(self.asker.query("status")).trips
 
     def command(self, echo: int) -> None:
         key = topics.key("command", "aero", session=self.asker.session)
@@ -131,6 +151,87 @@ def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:
     eventually("idle on the bus", lambda: ends.received_state() is PlantState.IDLE)
 
 
+@pytest.mark.parametrize("end", ["stop", "release", "silent node", "signal", "exception"])
+def test_the_node_is_sent_the_end_before_anything_is_published(end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of the bridge's own calls, which nothing on the network can change."""
+    journal: list[str] = []
+    node: list[CanLink] = []
+    beat, event, send = CanLink.beat, Node.event, ZenohLink.send
+
+    def journaled_beat(link: CanLink, heartbeat: Heartbeat) -> None:
+        if link is not node[0]:
+            journal.append(heartbeat.state)
+        beat(link, heartbeat)
+
+    def journaled_event(role: Node, kind: EventKind, *words: Any) -> None:
+        journal.append(kind)
+        event(role, kind, *words)
+
+    def failing_send(link: ZenohLink, frame: bytes) -> None:
+        if end == "exception":
+            raise OSError("no such device")
+        send(link, frame)
+
+    with Gathering() as gathering, closing(Ends(gathering)) as ends:
+        node.append(ends.node)
+        ends.hold()
+        monkeypatch.setattr(CanLink, "beat", journaled_beat)
+        monkeypatch.setattr(Node, "event", journaled_event)
+        monkeypatch.setattr(ZenohLink, "send", failing_send)
+        match end:
+            case "stop":
+                assert ends.asker.ask("stop").done
+            case "release":
+                assert ends.release()
+            case "silent node":
+                ends.fall_silent()
+            case "signal":
+                ends.role.stop.set()
+            case "exception":
+                ends.node.send(WIRE.measurement.pack(0, (0, 0, 0, 0, 0, 0)))
+        told = "released" if end in ("release", "signal") else "tripped"
+        eventually("the event", lambda: told in journal)
+        assert PlantState.IDLE in journal[: journal.index(told)]
+        if end == "exception":
+            ends.join()
+            assert isinstance(ends.raised, OSError)
+            assert "unexpected OSError: no such device" in ends.trip()
+            latch = Path(os.environ["STATE_DIRECTORY"], "aero.json")
+            assert Latch.model_validate_json(latch.read_bytes()).cause is TripCause.PLANT
+
+
+def test_a_measurement_from_before_a_session_is_none_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has arrived, but not yet been taken, when the claim is granted."""
+    links: list[CanLink] = []
+    connect = CanLink.__init__
+
+    def opened(link: CanLink, *words: Any, **options: Any) -> None:
+        connect(link, *words, **options)
+        links.append(link)
+
+    monkeypatch.setattr(CanLink, "__init__", opened)
+    with Gathering() as gathering, closing(Ends(gathering)) as ends:
+        ends.say(PlantState.IDLE)
+        take_inbox, early = ends.role.take_inbox, threading.Event()
+
+        def take_with_an_early_frame() -> bool:
+            if not early.is_set():
+                ends.node.send(WIRE.measurement.pack(0, (1, 1, 1, 1, 1, 1)))
+                eventually("the early frame", lambda: links[0].pending)
+            acted = take_inbox()
+            if acted:
+                early.set()
+            return acted
+
+        monkeypatch.setattr(ends.role, "take_inbox", take_with_an_early_frame)
+        ends.hold()
+        assert early.is_set()
+        frame = WIRE.measurement.pack(0, (0, 0, 0, 0, 0, 0))
+        ends.node.send(frame)
+        eventually("the measurement", lambda: bool(ends.received["measurement"]))
+        assert ends.received["measurement"] == [frame]
+
+
 def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed(ends: Ends) -> None:
     ends.hold()
     frames = [WIRE.measurement.pack(counter, (counter, 0, 0, 0, 0, 0)) for counter in range(10)]
@@ -155,6 +256,7 @@ def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed
     ("says", "why", "refused"),
     [
         ((PlantState.TRIPPED, TripCause.ENVELOPE, OURS), "tripped: attitude or rate envelope", None),
+        ((PlantState.TRIPPED, TripCause.SATURATION, OURS), "tripped: voltage saturation", None),
         ((PlantState.TRIPPED, None, OURS), "tripped: no cause reported", None),
         ((PlantState.IDLE, None, OURS), "was started again", None),
         (
@@ -170,6 +272,7 @@ def test_it_trips_when_the_node_has_left_the_session_and_reports_why(
     ends.hold()
     ends.say(*says)
     assert ends.trip() == f"node 1 {why}: 0 V"
+    assert ends.trips() == {says[1] or TripCause.NODE: 1}
     if refused:
         assert ends.asker.refusal() == refused
     else:

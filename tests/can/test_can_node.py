@@ -10,6 +10,7 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
+from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
@@ -87,6 +88,12 @@ class Bus:
             return self.endpoint.state is PlantState.DRIVEN
 
         self.until("the first command", driven)
+
+    def lose(self) -> None:
+        """Let the node's bus take no frame any more."""
+        link = self.front.link
+        assert isinstance(link, CanLink)
+        link.fault = "the bus is lost"
 
     def counters(self, least: int) -> list[int]:
         """Counters of all measurements that were not looked at yet, at least so many."""
@@ -180,6 +187,42 @@ def test_a_session_begins_with_a_number_that_is_granted_counts_from_0_and_ends_w
     seen = bus.counters(40)
     start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
     assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
+
+
+@pytest.mark.parametrize("end", ["release", "silence", "stop", "signal", "lost bus"])
+def test_the_motors_have_0_v_before_the_node_logs_that_its_session_ended_or_opens_the_bus_again(
+    end: str, bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, tuple[float, ...]]] = []
+
+    def logged(event: Event, _: str | None) -> None:
+        seen.append((event.kind, bus.plant.voltages))
+
+    def reopened(_: CanLink) -> bool:
+        seen.append(("reopened", bus.plant.voltages))
+        return False
+
+    bus.begin()
+    bus.drive()
+    bus.turn()
+    assert bus.plant.voltages != OFF
+    monkeypatch.setattr("aeroloop.plant_emulator.hosts.can_node.log_event", logged)
+    monkeypatch.setattr(CanLink, "reopen", reopened)
+    match end:
+        case "release":
+            bus.send_heartbeat(PlantState.IDLE)
+        case "silence":
+            monkeypatch.setattr(CanLink, "silent", True)
+        case "stop":
+            bus.endpoint.stop()
+        case "signal":
+            bus.endpoint.leave()
+        case "lost bus":
+            bus.lose()
+    bus.until("the end", lambda: any(kind in ("released", "tripped") for kind, _ in seen))
+    bus.turn()
+    assert {voltages for _, voltages in seen} == {OFF}
+    assert ("reopened" in [kind for kind, _ in seen]) == (end == "lost bus")
 
 
 def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:

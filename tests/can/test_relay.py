@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -86,6 +87,17 @@ def test_the_first_measurement_has_a_second_and_owes_nothing_to_the_time_of_the_
     assert not it.watch(later + 1_000_000_000 + FIRST_MEASUREMENT_NS - 1)
     assert it.watch(later + 1_000_000_000 + FIRST_MEASUREMENT_NS)
     assert "no first command within 1 s" in it.notices[-1].text
+
+
+def test_the_numbers_of_sessions_fit_a_heartbeats_four_bits_and_none_repeats_the_last() -> None:
+    it = Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
+    numbers = [it.number]
+    for _ in range(40):
+        assert isinstance(it.claim(claim_of()), Grant)
+        numbers.append(it.number)
+        it.release("of-a")
+    assert set(numbers) == set(range(16))
+    assert all(number != later for number, later in pairwise(numbers))
 
 
 def test_in_lockstep_a_session_waits_as_long_as_it_likes_for_all_but_its_first_command() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import sin
+from math import inf, nan, sin
 from typing import Any
 
 import pytest
@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.config import load
-from tests.support.own_plants import Turntable, TurntableSettings
+from tests.support.own_plants import Octoturntable, Turntable, TurntableSettings
 from tests.support.plant_end import Stage
 
 HERE = "tests.support.own_plants"
@@ -86,6 +86,15 @@ def test_no_voltage_beyond_the_supplys_limit_reaches_it(volts: float, limit: flo
     inner = Turntable(TurntableSettings(), PERIOD)
     OwnPlant(inner, limit).actuate((volts,))
     assert inner.volts == (volts,) if abs(volts) <= limit else abs(inner.volts[0]) == limit
+
+
+def test_a_voltage_that_is_no_number_is_0_v() -> None:
+    inner = Octoturntable(TurntableSettings(), PERIOD)
+    OwnPlant(inner, 24.0).actuate((nan, inf, -inf, 3.0, -25.0, nan, 24.0, -0.5))
+    assert inner.volts == (0.0, 24.0, -24.0, 3.0, -24.0, 0.0, 24.0, -0.5)
+    emulated = PlantSettings().build(PERIOD)
+    emulated.actuate((nan, -30.0))
+    assert emulated.truth().voltages == (0.0, -24.0)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial, partialmethod
 from math import atan2, ceil, isnan, pi
+from types import ModuleType
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -333,6 +334,19 @@ class FakeQuanser:
 
     def on_watchdog_stop(self) -> None:
         self.watchdog = None
+
+
+def modules(board: FakeQuanser) -> dict[str, ModuleType]:
+    """The package `quanser` with this board in it, by names for `sys.modules`."""
+    contents: dict[str, dict[str, Any]] = {
+        "quanser": {},
+        "quanser.hardware": {"HIL": board.HIL, "HILError": HILError, "Clock": Clock},
+        "quanser.hardware.enumerations": {"BufferOverflowMode": BufferOverflowMode},
+    }
+    made = {name: ModuleType(name) for name in contents}
+    for name, module in made.items():
+        module.__dict__.update(contents[name])
+    return made
 
 
 # ── checks of arguments ──

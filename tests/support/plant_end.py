@@ -139,10 +139,10 @@ class Asker:
     def ask(self, topic: str, request: Message | None = None, by: str | None = None) -> Answer:
         return Answer.model_validate_json(self.query(topic, (request or Request()).encode(), by))
 
-    def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
+    def claim(self, *, auto_arm: bool = True, wire: WireSpec = WIRE) -> Grant | Refusal:
         """Claim the plant as controller `a`, each time for another session."""
         self._claims += 1
-        claim = claim_of(period_ns=self._period_ns, auto_arm=auto_arm, session=self.session)
+        claim = claim_of(wire=wire, period_ns=self._period_ns, auto_arm=auto_arm, session=self.session)
         payload = self.query("claim", claim.encode())
         return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
 
@@ -221,9 +221,10 @@ class Stage(PlantNetwork):
         self._claims = 0
         self._ends = 0
 
-    def run(self, ticks: int) -> Self:
+    def run(self, ticks: int, answer_timeout_s: float = -1.0) -> Self:
+        """Run to a tick. In lockstep nothing comes by waiting, unless a longer time-out is given."""
         self._ends = ticks
-        with patch("aeroloop.plant_emulator.hosts.driver.ANSWER_TIMEOUT_S", -1.0):  # nothing comes by waiting
+        with patch("aeroloop.plant_emulator.hosts.driver.ANSWER_TIMEOUT_S", answer_timeout_s):
             Driver(self.endpoint, self, self.loop, self.stop, self.clock).run()
         return self
 

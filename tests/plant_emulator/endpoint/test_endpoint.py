@@ -15,16 +15,18 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, VehicleClaim
 from aeroloop.plant_emulator.endpoint.limits import LimitMonitor, LimitSettings
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Grant, Refusal, SessionRecord
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED, Policy
 from tests.support.plant_end import (
     AT_REST,
     COUNTERS,
     OFF,
     PERIOD_NS,
+    REST,
     WIRE,
     RecordingPlant,
     claim_of,
@@ -158,6 +160,60 @@ def test_what_may_last_a_while_trips_just_after_it(limit: str, cause: TripCause)
     assert (endpoint.trip, plant.voltages) == (cause, OFF)
 
 
+@pytest.mark.parametrize("code", [31, -31])
+def test_a_motor_is_saturated_at_either_end_of_its_range(code: int) -> None:
+    endpoint, _ = driven(LimitSettings(max_saturated_s=0.02))
+    for k in range(1, 12):
+        endpoint.tick(WIRE.command.pack(k, [0, code]), k + 1)
+    assert endpoint.trip is TripCause.SATURATION
+
+
+@pytest.mark.parametrize(
+    ("limit", "cause"), [("max_saturated_s", TripCause.SATURATION), ("max_invalid_s", TripCause.SENSORS)]
+)
+def test_what_may_last_a_while_counts_from_its_own_sessions_start(limit: str, cause: TripCause) -> None:
+    """Nine ticks of the last session and ten of this one are no more than ten in a row."""
+    endpoint, plant = driven(LimitSettings.model_validate({limit: 0.02}))
+    saturates = cause is TripCause.SATURATION
+    codes = [31, -31] if saturates else [5, 5]
+    plant.now = REST if saturates else Measurement((nan, 0.0, 0.0, 0.0), AT_REST)
+    for k in range(1, 9):
+        endpoint.tick(WIRE.command.pack(k, codes), k + 1)
+    assert endpoint.release("of-a")
+    assert isinstance(endpoint.claim(claim_of("b")), Grant)
+    endpoint.tick(None, 10)  # the first of a session, which is at 0 V
+    for k in range(9):
+        assert endpoint.tick(WIRE.command.pack(k, codes), 11 + k) is not None
+    endpoint.tick(WIRE.command.pack(9, codes), 20)
+    endpoint.tick(WIRE.command.pack(10, codes), 21)
+    assert endpoint.trip is cause
+
+
+def test_quansers_board_is_saturated_where_it_clips() -> None:
+    """It clips at plant.quanser.voltage_limit, which is less than what a command can say: 18 V of 23.6."""
+    settings = PlantSettings(via="quanser", limits=LimitSettings(max_saturated_s=0.02))
+    endpoint = settings.endpoint(RecordingPlant(), LoopSettings(), WIRE)
+    assert isinstance(endpoint.claim(claim_of()), Grant)
+    endpoint.tick(None, 0)
+    below, at_limit = (WIRE.voltage.quantizer().encode(volts) for volts in (17.5, 18.5))
+    for k in range(20):
+        endpoint.tick(WIRE.command.pack(k, [below, 0]), k + 1)
+    assert endpoint.state is PlantState.DRIVEN
+    for k in range(20, 32):
+        endpoint.tick(WIRE.command.pack(k, [at_limit, 0]), k + 1)
+    assert endpoint.trip is TripCause.SATURATION
+
+
+@pytest.mark.parametrize("length", [1.0, 1.005, 1 + 1e-9])
+@pytest.mark.parametrize("direction", [0.0, 0.3, 1.1, 2.2])
+def test_a_limit_of_180_degrees_is_beyond_no_attitude(length: float, direction: float) -> None:
+    endpoint, plant = driven(LimitSettings(max_tilt_deg=180.0))
+    upside_down = (0.0, length * cos(direction), length * sin(direction), 0.0)
+    plant.now = Measurement(upside_down, AT_REST)
+    assert endpoint.tick(None, 2) is not None
+    assert endpoint.trip is None
+
+
 # ── record of the last session, for the next controller ──
 
 
@@ -174,10 +230,17 @@ def end(request: pytest.FixtureRequest) -> VehicleClaim:
     return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
 
 
+def stopped(end: VehicleClaim) -> TripCause | None:
+    end.stop()
+    return end.trip
+
+
 ENDINGS: list[tuple[Callable[[VehicleClaim], object], TripCause | str]] = [
     (lambda end: end.release("of-a"), "released"),
     (lambda end: end.lost("a"), TripCause.HOLDER_GONE),
     (lambda end: end.stop(), TripCause.OPERATOR),
+    # A session that an operator's stop followed is not to be resumed, however it had ended before.
+    (lambda end: [end.release("of-a"), stopped(end)], TripCause.OPERATOR),
 ]
 
 
@@ -191,6 +254,7 @@ def test_the_next_controller_gets_the_last_record_and_how_its_session_ended(
     assert end.keep(record_of("a"))
     assert not end.keep(record_of("b"))  # of another controller, of another session
     assert not end.keep(record_of("a").model_copy(update={"session": "of-b"}))
+    assert not end.keep(record_of("a").model_copy(update={"controller": "b"}))
     assert end.keep(record_of("a", within_s=5.0))  # the newest counts
     assert end.changes == changes  # it is no change of the trace
     ends(end)
@@ -201,12 +265,28 @@ def test_the_next_controller_gets_the_last_record_and_how_its_session_ended(
     assert last_granted(end, "c") is None  # a session without a record leaves none
 
 
+def test_a_stop_before_any_session_leaves_no_record(end: VehicleClaim) -> None:
+    end.stop()
+    assert end.last is None
+
+
 def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: VehicleClaim) -> None:
     end.stop()
     end.stop(TripCause.DUPLICATE, "two plants")
     end.stop()
     assert (end.trip, [notice.kind for notice in end.notices]) == (TripCause.DUPLICATE, ["tripped", "tripped"])
     assert end.trips == {TripCause.OPERATOR: 1, TripCause.DUPLICATE: 1}
+
+
+# ── faults ──
+
+
+def test_a_fault_that_begins_in_a_skipped_tick_has_that_tick_in_its_event() -> None:
+    endpoint, _ = claimed()
+    endpoint.inject(PlantSettings(faults=["rate:bias=0.1@0.01..0.02"]).parsed_faults)
+    endpoint.notices.clear()
+    endpoint.tick(None, 20)  # ticks 1 to 19 are skipped
+    assert [(notice.kind, notice.tick) for notice in endpoint.notices] == [("fault", 5), ("fault", 10)]
 
 
 # ── the on-change policy: frames sent, levels held, and the end of holding ──
@@ -309,4 +389,18 @@ def test_a_heartbeat_without_a_valid_value_is_forgiven_as_long_as_a_measurement_
         assert state_of(endpoint) is PlantState.DRIVEN
         assert plant.periods[-1] == (OFF if k > 5 else volts())
     endpoint.tick(invalid(10 + HEARTBEAT), 11 + HEARTBEAT)
+    assert endpoint.trip is TripCause.INVALID_COMMAND
+
+
+def test_no_measurement_of_an_earlier_session_forgives_a_command() -> None:
+    """Its last counters, without a valid value, are just before this session's first, as the counter comes round."""
+    endpoint, plant = claimed(BOTH)
+    for k in range(1, COUNTERS):
+        plant.now = turning(nan if k >= COUNTERS - HEARTBEAT else 0.0)
+        endpoint.tick(invalid(k - 1) if k > COUNTERS - HEARTBEAT else command(k - 1), k)
+    assert state_of(endpoint) is PlantState.DRIVEN
+    plant.now = turning(0.0)
+    claim_again(endpoint)
+    assert endpoint.tick(None, COUNTERS)
+    endpoint.tick(invalid(0), COUNTERS + 1)
     assert endpoint.trip is TripCause.INVALID_COMMAND

@@ -9,7 +9,7 @@ from math import cos, inf, isnan, nan, nextafter, sin, sqrt, ulp
 from statistics import fmean, pstdev
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -269,6 +269,7 @@ def test_a_garbled_frame_differs_in_exactly_one_bit_and_in_any() -> None:
 # ── begin and end ──
 
 
+@example(period=0.009, start=27, length=None)
 @given(
     period=st.sampled_from((0.002, 0.009, 1 / 300, 0.1)),
     start=st.integers(0, 300),
@@ -310,7 +311,47 @@ def test_nothing_fails_and_no_time_passes_before_the_start() -> None:
     assert missing(plant.seen().rate)
 
 
+@pytest.mark.parametrize(
+    ("kind", "first", "later"),
+    [
+        ("stuck", b"new", b"new"),
+        ("delay=0.1", b"", b"new"),
+        ("duplicate=1", b"new", b"newnewer"),
+        ("reorder=1", b"", b"newernew"),
+    ],
+)
+def test_no_frame_of_a_session_acts_in_the_next(kind: str, first: bytes, later: bytes) -> None:
+    """Neither one that was held back nor the last one that passed."""
+    plant = Faulty(f"command:{kind}@0.2")
+    for frame in (b"old", b"older", b"oldest"):
+        plant.commands(frame)
+        plant.advance()
+    plant.faults.forget_frames()
+    assert b"".join(plant.commands(b"new")) == first
+    plant.advance()
+    assert b"".join(plant.commands(b"newer")) == later
+
+
+def test_a_fault_injected_in_a_session_holds_no_frame_of_the_one_before() -> None:
+    plant = Faulty()
+    assert plant.commands(b"old") == [b"old"]
+    plant.faults.forget_frames()
+    plant.inject("command:stuck")
+    assert plant.commands(b"new") == [b"new"]
+    assert plant.commands(b"newer") == [b"new"]
+
+
 # ── injection ──
+
+
+def test_a_motor_that_is_stuck_after_the_others_faults_were_cleared_holds_what_was_commanded() -> None:
+    plant = Faulty("motors:off")
+    plant.actuate((5.0, -5.0))
+    plant.advance()
+    assert plant.voltages == (0.0, 0.0)
+    plant.inject("motor1:stuck", clear=True)
+    plant.actuate((7.0, -7.0))
+    assert plant.voltages == (5.0, -7.0)
 
 
 def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:

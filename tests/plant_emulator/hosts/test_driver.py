@@ -13,12 +13,14 @@ from aeroloop.plant_emulator.endpoint.endpoint import Notice
 from aeroloop.plant_emulator.faults.injection import MAX_FAULTS
 from aeroloop.plant_emulator.faults.language import KINDS, SIGNALS
 from aeroloop.plant_emulator.hosts.driver import IDLE_WAIT_S
+from aeroloop.plant_emulator.model.emulated import FrictionSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent
 from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.protocol.wire.transmit import UNCHANGED
 from tests.support.plant_end import Stage
+from tests.support.simulated_link import wire_of
 
 LOOP = LoopSettings(realtime="off")
 WIRE = WireSpec()
@@ -99,6 +101,7 @@ def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
         ("claim", 4),
         ("release", 20),
         ("claim", 30),
+        ("release", 400),  # by the driver, which ends
     ]
 
 
@@ -134,6 +137,22 @@ def test_what_is_not_acted_upon_is_in_its_row(frame: bytes, received_as: Sent, o
     assert rows(batches, "outcome")[row] == outcome
     if received_as is Sent.FRAME:
         assert b"".join(b.columns["command"].tobytes() for b in batches)[row * len(frame) :][: len(frame)] == frame
+
+
+def test_in_lockstep_a_silent_measurement_is_answered_before_the_next_tick() -> None:
+    """At rest, most measurements are silent; each still has the counter after the last, which its answer echoes."""
+    wire = wire_of("on_change", "periodic")
+    loop = LoopSettings(realtime="off", lockstep=True)
+
+    def answer_silence(stage: Stage, _: bytes) -> None:
+        echo = stage.endpoint.session_tick % wire.measurement.counters
+        stage.wires.deliver(wire.command.pack(echo, (0, 0)), stage.endpoint.ticked)
+
+    plant = PLANT.model_copy(update={"friction": FrictionSettings(coulomb=(1.0, 1.0))})  # so that it stays at rest
+    stage = Stage(loop, wire, plant, between=at({-1: Stage.claim}), answer=answer_silence).run(100)
+    assert stage.wires.sent.count(UNCHANGED) > 50
+    assert rows(stage.batches, "outcome") == [Outcome.NONE] + [Outcome.ACTED] * 100
+    assert rows(stage.batches, "answered")[1:] == [*range(100)]
 
 
 # ── faults: one to come changes nothing, and each begin, end and frame counts ──

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from math import cos, inf, isnan, nan, pi, sin
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -27,7 +26,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from tests.support import fake_quanser
 from tests.support.clock import FakeClock
-from tests.support.fake_quanser import BufferOverflowMode, Clock, FakeQuanser, HILError
+from tests.support.fake_quanser import BufferOverflowMode, FakeQuanser
 from tests.support.plant_end import claim_of
 
 PERIOD = 0.002
@@ -51,14 +50,7 @@ def plant_on_board(*, realtime: bool = False, session: bool = True, **changed: A
 
 def plant_of(board: FakeQuanser, settings: QuanserSettings = AERO.quanser) -> QuanserPlant:
     """A plant on this board, which is what `import quanser.hardware` finds."""
-    names = {"HIL": board.HIL, "HILError": HILError, "Clock": Clock}
-    for module, of in (
-        ("quanser", {}),
-        ("quanser.hardware", names),
-        ("quanser.hardware.enumerations", {"BufferOverflowMode": BufferOverflowMode}),
-    ):
-        sys.modules[module] = ModuleType(module)
-        sys.modules[module].__dict__.update(of)
+    sys.modules.update(fake_quanser.modules(board))
     return QuanserPlant(settings, PERIOD, AERO.watchdog_s)
 
 

@@ -170,6 +170,34 @@ def test_a_file_that_cannot_be_read_counts_as_a_stop_and_is_named(tmp_path: Path
     assert str(path) in found.text
 
 
+def test_a_failure_to_write_an_older_latch_does_not_delay_the_newer_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails while it writes a trip, and a stop already waits: it is tried at once, not after `RETRY_S`."""
+    begun, failing = threading.Event(), threading.Event()
+    failing.set()
+
+    def fsync(descriptor: int) -> None:
+        if failing.is_set():
+            begun.set()
+            assert renewed.wait(PATIENCE_S), descriptor
+            failing.clear()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    renewed = threading.Event()
+    file = LatchFile(tmp_path, "aero")
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(latch_file, "RETRY_S", 10 * PATIENCE_S)
+    monkeypatch.setattr(latch_file, "KEPT_S", PATIENCE_S)
+    file.keep(TRIP)
+    assert begun.wait(PATIENCE_S)
+    file.keep(STOP)
+    renewed.set()
+    file.wait()
+    assert file.unkept is None
+    assert Latch.model_validate_json(file.path.read_bytes()) == STOP
+
+
 def test_a_full_disk_is_said_leaves_the_file_whole_and_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

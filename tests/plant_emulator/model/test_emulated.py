@@ -342,3 +342,29 @@ def test_gusts_have_the_configured_mean_deviation_and_memory_whatever_the_period
         assert np.abs(correlation - exp(-seconds / memory)).max() < 5 * sqrt(spread)
     cross = (x[:, 0] * x[:, 1]).mean() / sigma**2
     assert abs(cross) < 5 * sqrt((1 + rho**2) / (1 - rho**2) / n)  # the axes are independent
+
+
+# ── a plant that goes on with other settings ──
+
+
+def test_other_sensors_go_on_from_the_filters_memory_of_those_before() -> None:
+    """Other zeros of the encoders shift the angles by a step at the most, which the filter shows as 0.02 rad/s.
+
+    Filters that start anew would show a body at rest.
+    """
+    before = PlantSettings()
+    after = before.model_copy(update={"sensors": SensorSettings(seed=1)})
+    plant, unchanged = before.build(PERIOD), before.build(PERIOD)
+    for each in (plant, unchanged):
+        for _ in range(300):
+            each.actuate((10.0, -10.0))
+            each.advance()
+    continued = after.continued(plant, before, PERIOD)
+    assert continued.measure() == unchanged.measure()
+    for each in (continued, unchanged):
+        each.advance()
+    (_, _, z), (_, _, expected) = continued.measure().rate, unchanged.measure().rate
+    assert abs(expected) > 0.1
+    assert abs(z - expected) < 0.03
+    assert continued.measure() != unchanged.measure()
+    assert continued.truth() == unchanged.truth()

@@ -87,6 +87,30 @@ thread.join()
 """
 
 
+ENDED_THREAD = """
+import os
+from aeroloop.protocol.runtime import realtime
+from aeroloop.protocol.wire.spec import LoopSettings
+
+there, asked = os.listdir("/proc/self/task"), []
+os.listdir = lambda path: ["999999999", *there]  # the first has ended since
+
+def ask(thread, *_):
+    asked.append(thread)
+    if thread == 999999999:
+        raise ProcessLookupError(3, "No such process")
+
+os.sched_setaffinity = os.sched_setscheduler = ask
+refused = realtime.prepare_process(LoopSettings(cpus=[0]))
+assert not any("No such process" in line for line in refused), refused
+assert asked == 2 * [999999999, *map(int, there)], asked
+"""
+
+
+def test_a_thread_that_ends_meanwhile_leaves_the_others_their_settings() -> None:
+    subprocess.run([sys.executable, "-c", ENDED_THREAD], timeout=60, check=True)
+
+
 @pytest.mark.skipif(
     (platform.system(), platform.machine()) not in {("Linux", "x86_64"), ("Linux", "aarch64")},
     reason="other systems have no such filter",

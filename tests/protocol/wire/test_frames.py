@@ -201,6 +201,19 @@ def test_a_frame_held_up_for_too_long_is_judged_wrongly_alone() -> None:
     assert found == [None, None, *range(27, 40)]
 
 
+def test_a_counter_of_4_bits_stands_for_twelve_ticks_before_now_to_three_after() -> None:
+    def advanced(tick: int, now: int) -> int | None:
+        ticks = TickCounter(PERIOD_NS, 16, lockstep=False)
+        for k in range(81):
+            ticks.advance(k % 16, k * PERIOD_NS)
+        return ticks.advance(tick % 16, now * PERIOD_NS)
+
+    assert [advanced(81 + early, 81) for early in (0, 1, 2, 3)] == [81, 82, 83, 84]
+    assert advanced(81 + 4, 81) is None  # read as twelve ticks before, which is not newer
+    assert [advanced(100 - late, 100) for late in (1, 11, 12)] == [99, 89, 88]
+    assert advanced(100 - 13, 100) == 103
+
+
 # ── transmit policy: a frame at once for a new level, else at the heartbeat, and not before ──
 
 
