@@ -27,7 +27,8 @@ from aeroloop.protocol.errors import ConfigError
 
 T = TypeVar("T")
 
-_HERE: Final = str(Path(__file__).parent.parent)
+_OURS: Final = tuple(str(Path(__file__).parents[1] / name) for name in ("protocol", "plant_emulator", "service"))
+"""Folders of this package's code. In a clone tests and a user's files lie beside them."""
 _PACKAGES: Final = {"site-packages", "dist-packages"}
 
 
@@ -142,7 +143,7 @@ def exception_line(error: BaseException, called: Any = None) -> str:
     """
     text = " ".join(str(error).split())
     line = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    ours = _HERE, "<frozen", get_path("stdlib")
+    ours = (*_OURS, "<frozen", get_path("stdlib"))
     files = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     theirs = [(file, line) for file, line in files if not str(file).startswith(ours) and not _PACKAGES & {*file.parts}]
     return line + (f" ({theirs[-1][0].name}, line {theirs[-1][1]})" if theirs else place_of(called))

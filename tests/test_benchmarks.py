@@ -22,9 +22,15 @@ RUNS: Final = {
     "tests.benchmarks.design": ["4", "40", "--duration=1", "--set=law.damping_bound=0.0126"],
     "tests.benchmarks.firmware": [],
     "tests.benchmarks.fit": ["as configured"],
+    "tests.benchmarks.floods": ["--tries", "1", "tcp=20"],
     "tests.benchmarks.loss": ["--seconds=3", "--transport", "mixed", "--", "loss=0"],
 }
-NEEDS: Final = {"tests.benchmarks.firmware": "qemu-system-arm", "tests.benchmarks.loss": "nft"}
+NEEDS: Final = {
+    "tests.benchmarks.firmware": "qemu-system-arm",
+    "tests.benchmarks.floods": "nft",
+    "tests.benchmarks.loss": "nft",
+}
+ON_NETWORK_NAMESPACES: Final = ("tests.benchmarks.floods", "tests.benchmarks.loss")
 
 
 def test_every_benchmark_has_a_smoke_run() -> None:
@@ -40,7 +46,7 @@ def test_a_benchmark_prints_figures(program: str) -> None:
     """In real time, as some run the loop; nothing is asserted of the figures."""
     if program in NEEDS and shutil.which(NEEDS[program]) is None:
         pytest.skip(f"{NEEDS[program]} is not installed")
-    if program == "tests.benchmarks.loss" and os.geteuid() != 0:
+    if program in ON_NETWORK_NAMESPACES and os.geteuid() != 0:
         pytest.skip("network namespaces need root")
     command = [sys.executable, "-m", program, *RUNS[program]]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST_S, check=False)

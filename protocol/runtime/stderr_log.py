@@ -14,10 +14,19 @@ from queue import Full, Queue
 from threading import Event
 from typing import Any, Final
 
+from aeroloop.protocol.printable import printable
+
 WAITING: Final = 1000  # most messages that wait for stderr
 FLUSH_S: Final = 0.5  # longest wait at the end of the process for those that were not written yet
 STDERR: Final = 2
 _LINE: Final = "%(asctime)s %(levelname)s %(role)s: %(message)s"
+
+
+class _OneLine(logging.Formatter):
+    """Formats a record as one printable line, whatever names and texts of the network it has."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # of the library
+        return printable(super().formatMessage(record))
 
 
 class _Stderr(logging.Handler):
@@ -60,7 +69,7 @@ class StderrLog(QueueHandler):
         self._full = 0  # messages that found the queue full
         self._reported = 0  # of those, how many a line has reported
         self._stderr = _Stderr()
-        self._stderr.setFormatter(logging.Formatter(_LINE, defaults={"role": "aeroloop"}))
+        self._stderr.setFormatter(_OneLine(_LINE, defaults={"role": "aeroloop"}))
         _Listener(self._messages, self._stderr).start()
 
     @property

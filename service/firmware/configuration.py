@@ -27,6 +27,7 @@ def config_header(settings: Settings) -> str:
     full = min(plant.voltage_limit, wire.voltage.quantizer().outermost)
     limits = LimitMonitor(plant.limits, period_ns, full)
     identity = ", ".join(f"0x{byte:02x}" for byte in fingerprint(wire, period_ns, lockstep=loop.lockstep))
+    silent_s = LOCKSTEP_SILENT_S if loop.lockstep else SILENT_S
     defined: list[tuple[str, int | str, str]] = [
         ("ACTUATORS", wire.actuators, "motors"),
         ("PERIOD_NS", period_ns, "of a tick [ns]"),
@@ -64,7 +65,7 @@ def config_header(settings: Settings) -> str:
         ("CAN_NODE", can.node, "number of the plant on the bus"),
         ("CAN_FD", int(can.fd), "CAN FD, which frames of more than 8 bytes need"),
         ("CAN_HEARTBEAT_NS", round(HEARTBEAT_S * 1e9), "from heartbeat to heartbeat [ns]"),
-        ("CAN_SILENT_NS", round((LOCKSTEP_SILENT_S if loop.lockstep else SILENT_S) * 1e9), "a peer that is silent for longer is gone [ns]"),
+        ("CAN_SILENT_NS", round(silent_s * 1e9), "a peer that is silent for longer is gone [ns]"),
         ("FINGERPRINT", f"{{{identity}}}", "of wire, period and lockstep"),
         ("CONFIG", config_number(settings), "of all settings: what is linked together has the same"),
     ]

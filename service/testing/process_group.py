@@ -197,7 +197,7 @@ class ProcessGroup:
     def start_loop(
         self, *, drive: bool = True, own_node: bool = False, environment: Mapping[str, str] | None = None
     ) -> None:
-        """Start recorder, plant end, an emulated node on the CAN bus if it is to have one, and to drive it a controller.
+        """Start recorder, plant end, an emulated node on the CAN bus if there is to be one, and a controller.
 
         Waits for recorder and plant.
 

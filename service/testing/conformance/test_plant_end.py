@@ -42,9 +42,7 @@ def times(log: HilLog, kind: str, role: str) -> list[int]:
     return [at for at, event in log.messages(Event) if event.kind == kind and event.role == role]
 
 
-def test_it_measures_at_its_rate_counting_from_0_and_the_loop_tracks(
-    hil: Hil, patient: dict[str, object]
-) -> None:
+def test_it_measures_at_its_rate_counting_from_0_and_the_loop_tracks(hil: Hil, patient: dict[str, object]) -> None:
     hil.start(settings={**patient, "reference.amplitude": [0, 10, 20]}, drive=False)
     frames: list[tuple[int, bytes]] = []
     hil.processes.zenoh.declare_subscriber(
@@ -115,9 +113,7 @@ def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil, hil_plant: str, pa
     assert "voltage" in hil.log.trips[0]
 
 
-def test_without_a_valid_measurement_it_trips_and_says_so(
-    hil: Hil, hil_plant: str, patient: dict[str, object]
-) -> None:
+def test_without_a_valid_measurement_it_trips_and_says_so(hil: Hil, hil_plant: str, patient: dict[str, object]) -> None:
     if hil_plant in ("can", "can-node-c", "quanser"):
         pytest.skip("only an emulated plant's sensors fail on request")
     hil.start(settings={**patient, "plant.faults": ["rate:off@0.3"]}, drive=False)

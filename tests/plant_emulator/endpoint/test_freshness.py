@@ -82,7 +82,7 @@ class RelayEnd:
             held.append(relay.voltages)
             self._now_ns += PERIOD_NS
         self._measured += ticks
-        measured = relay.measurement(WIRE.measurement.pack(self._measured % COUNTERS, [0] * 6))
+        measured = relay.measurement(WIRE.measurement.pack(self._measured % COUNTERS, [0] * 6), self._now_ns)
         if self._measured == 0:
             relay.watch(self._now_ns)
         return measured is not None, held

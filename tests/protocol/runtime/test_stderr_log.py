@@ -64,7 +64,7 @@ def test_once_it_is_read_again_a_line_says_how_many_were_dropped_and_the_log_goe
         process.stdin.flush()
         lines += pipe.read_lines(2)
         process.communicate(timeout=LONGEST_S)
-    assert "umlauts: ü, \\udcff" in lines[0]
+    assert lines[0].endswith("umlauts: ü,  ")  # what is not printable is a space
     assert re.fullmatch(r"[-0-9]+ [:,0-9]+ WARNING aeroloop: umlauts: .*", lines[0])
     assert [line.rpartition(" ")[2] for line in lines[1:-2]] == [str(i) for i in range(MANY - dropped)]
     assert lines[-2].endswith(f" WARNING aeroloop: {dropped} lines of this log were dropped: nothing read stderr")

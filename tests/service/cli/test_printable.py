@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -78,7 +79,12 @@ def test_a_status_its_troubles_an_answer_and_an_error_are_printable(
         captured = capfd.readouterr()
         assert CLEAN in captured.out
         assert acts_on_a_terminal(captured.out + captured.err) == []
-    monkeypatch.setattr(operator, "stop", lambda *_: ([HOSTILE], [HOSTILE]))
+
+    def stop(*_: object, on_answer: Callable[[str], None]) -> tuple[list[str], list[str]]:
+        on_answer(HOSTILE)
+        return [HOSTILE], [HOSTILE]
+
+    monkeypatch.setattr(operator, "stop", stop)
     monkeypatch.setattr(operator, "send", lambda *_: HOSTILE)
     monkeypatch.setattr(operator, "only_vehicle", lambda _: VEHICLE)
     for words in ("op stop", "op arm"):

@@ -23,7 +23,7 @@ from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
-from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.transport.can_format import LOCKSTEP_SILENT_S, SILENT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import LoopSettings, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Transmit
@@ -147,6 +147,7 @@ class Controller:
         self._wire, self._node, self._random = wire, can_bus.node, Random(seed)
         self._mark = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._quantizer = wire.voltage.quantizer()
+        self._silent_s = LOCKSTEP_SILENT_S if loop.lockstep else SILENT_S
         self._silent = loop.lockstep and wire.transmit.command == "on_change"
         self.mood, self._left, self._late, self._number, self._beat_due = "good", 0, 0, 0, 0
         self._echoes: deque[int] = deque(maxlen=300)
@@ -167,7 +168,9 @@ class Controller:
 
     def pause_ns(self) -> int:
         """For how long the node is kept from its tick [ns]: so it notices silence before its watchdog does."""
-        return 510_000_000 if self.mood == "gone" and self._random.random() < 0.3 else 0
+        if self.mood != "gone" or self._random.random() >= 0.3:
+            return 0
+        return round((self._silent_s + 0.01) * 1e9)
 
     def frames(self, now_ns: int) -> list[tuple[int, bytes]]:
         """What the node receives before a tick."""
