@@ -16,6 +16,7 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.runtime.host import name_process
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network import COMMAND_S, command_session, join
 from aeroloop.protocol.transport.network_settings import Endpoint, Identity, NetworkSettings, SecuritySettings
@@ -179,6 +180,7 @@ def test_with_certificates_a_stop_is_done_once_the_plant_of_every_vehicle_has_an
 def test_with_certificates_what_may_be_the_plant_of_a_vehicle_that_has_not_answered_is_named(
     secured: NetworkSettings,
 ) -> None:
+    name_process("plant")  # another test in this process may have run a role that is known to be no plant
     places = [Endpoint.parse(text) for text in secured.rendezvous_endpoints]
     with closing(join(secured, Identity(("plant",), "aero"))) as session, socket.create_server(places[-1].address):
         Plant(session, "aero", promptly)
