@@ -41,6 +41,11 @@ class _Stderr(logging.Handler):
         """Have no lock: one thread writes, and `logging.shutdown` must not wait for it."""
         self.lock = None
 
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Write a message. The library's own takes the lock, since Python 3.13 even where there is none."""
+        self.emit(record)
+        return True
+
     def emit(self, record: logging.LogRecord) -> None:
         line = f"{self.format(record)}\n".encode(errors="backslashreplace")
         try:
